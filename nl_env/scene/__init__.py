@@ -1,0 +1,1 @@
+"""Synthetic driving scenes: traffic, world, weather and the renderer."""

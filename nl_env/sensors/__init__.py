@@ -1,0 +1,1 @@
+"""Sensor models: event camera and LiDAR."""
