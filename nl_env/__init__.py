@@ -1,3 +1,20 @@
-"""Gymnasium benchmark for adaptive depth sensing with an event camera and a LiDAR."""
+"""Gymnasium benchmark for adaptive depth sensing with an event camera and a LiDAR.
+
+Importing this package registers its environments; the classes behind them load with ``gymnasium.make``.
+"""
+
+from gymnasium.envs.registration import register, registry
 
 __version__ = "0.1.0"
+
+ENTRY_POINTS = {"nl_env/Driving-v0": "nl_env.driving:DrivingEnv"}
+
+
+def register_envs() -> None:
+    """Register every environment id; calling it again changes nothing."""
+    for env_id, entry_point in ENTRY_POINTS.items():
+        if env_id not in registry:
+            register(env_id, entry_point=entry_point)
+
+
+register_envs()

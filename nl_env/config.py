@@ -20,6 +20,13 @@ WEATHERS = tuple(
 NOISE_PRESETS = ("ideal", "realistic")
 LIDAR_RATES = (1, 2, 5, 10, 25)
 LIDAR_BEAMS = (0, 16, 32, 64, 128)
+SPLITS = {
+    "train": range(0, 1_900_000_000),
+    "val": range(1_900_000_000, 2_000_000_000),
+    "test": range(2_000_000_000, 2**31),
+}
+"""Sequence seeds of each split; a sequence belongs to exactly one. ``SPLITS["test"][:48]`` are the first 48
+test sequences. Resets without a seed draw training sequences only."""
 
 T = TypeVar("T")
 
@@ -56,7 +63,7 @@ class SceneConfig:
     style: str | None = None
     weather: str | None = None
     duration_s: float = 20.0
-    fov_deg: float = 70.0
+    fov_deg: float = 76.0
     camera_height: float = 2.4
     vibration: float = 0.3
 
@@ -72,7 +79,7 @@ class SceneConfig:
     @property
     def slices(self) -> int:
         """Number of whole 20 ms slices."""
-        return int(round(self.duration_s * 1e6)) // SLICE_US
+        return round(self.duration_s * 1e6) // SLICE_US
 
 
 @dataclass(frozen=True)

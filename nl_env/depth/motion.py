@@ -1,0 +1,285 @@
+"""Ego motion between two depth frames: a small projective ICP on inverse depth.
+
+Every pixel of the old frame is moved, projected into the new one, and compared with the surface found
+there. The residual is the difference of inverse depth along the ray; linearised with the new frame's
+inverse-depth slope it is the point-to-plane distance of projective ICP, and it stays finite for the
+sky, whose outline is good evidence outdoors. Coarse to fine, from several starts, with bounded
+weights against moving objects, edges and disocclusions.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nl_env.depth.warp import inverse_depth
+from nl_env.types import Camera
+
+FINEST_WIDTH = 160
+"""The finest pyramid level is the first one no wider than this; each coarser one halves it."""
+
+STRIDE = 2
+"""The finest level compares every second pixel of every second row."""
+
+SCALES = (0.005, 0.01, 0.02, 0.05)
+"""Relative residual from which a pixel is an outlier, finest level first. Blurred edges bias the
+estimate towards longer motions, so the finest levels trust clean surfaces only."""
+
+ITERATIONS = 15
+"""Gauss-Newton steps a level at most."""
+
+CONVERGED = 3e-4
+"""A level ends when the largest component of its step (m, rad) is below this."""
+
+STARTS = (0.0, 1.0, 2.0, 3.0)
+"""Metres forward from the guess that the coarsest level is tried from; the best one is refined.
+Small motions are found from any of them, fast driving (30 m/s at 10 Hz) needs the far ones."""
+
+_SKY = 0.005
+"""Inverse depth (1/m) added to the scale of relative residuals: below it, differences count less."""
+
+_DAMPING = np.array([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4])
+"""Added to the mean normal equations: what the frames do not determine stays at the start."""
+
+
+def se3_exp(twist: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid motion ``(4, 4)`` of a twist ``(6,)``: translation part (m), then rotation vector (rad)."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix()
+    motion[:3, 3] = _mean_rotation(twist[3:]) @ twist[:3]
+    return motion
+
+
+def se3_log(motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The twist ``(6,)`` of a rigid motion ``(4, 4)``; the inverse of :func:`se3_exp`."""
+    rotation = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    return np.concatenate([np.linalg.solve(_mean_rotation(rotation), motion[:3, 3]), rotation])
+
+
+def continued(motion: NDArray[np.float64], fraction: float) -> NDArray[np.float64]:
+    """Constant velocity: the motion over ``fraction`` times the duration of ``motion`` (4x4)."""
+    return se3_exp(fraction * se3_log(motion))
+
+
+def estimate_motion(
+    old: NDArray[np.float32],
+    new: NDArray[np.float32],
+    camera: Camera,
+    max_depth: float,
+    guess: NDArray[np.float64] | None = None,
+) -> NDArray[np.float64]:
+    """Rigid motion that takes points from the old frame's camera to the new frame's.
+
+    Directions the frames do not determine (the way along a featureless road; everything, when a
+    frame has no return) stay at ``guess``.
+
+    Args:
+        old, new: ``(H, W)`` float32 m, 0 = no return.
+        camera: intrinsics of both.
+        max_depth: sensor range, m.
+        guess: ``(4, 4)`` start, for instance the previous motion; default standing still.
+
+    Returns:
+        ``(4, 4)`` float64.
+
+    Raises:
+        ValueError: a frame does not have the camera's shape or ``guess`` is not ``(4, 4)``.
+    """
+    for name, frame in (("old", old), ("new", new)):
+        if frame.shape != camera.shape:
+            raise ValueError(f"{name}: found shape {frame.shape}, expected the camera's, {camera.shape}")
+    start = np.eye(4) if guess is None else np.ascontiguousarray(guess, np.float64)
+    if start.shape != (4, 4):
+        raise ValueError(f"guess: found shape {start.shape}, expected (4, 4)")
+
+    sources = _pyramid(inverse_depth(np.ascontiguousarray(old, np.float32), max_depth))
+    targets = _pyramid(inverse_depth(np.ascontiguousarray(new, np.float32), max_depth))
+    levels = [
+        (source, target, _intrinsics(camera, source.shape[0]), scale, STRIDE if source is sources[0] else 1)
+        for source, target, scale in zip(sources, targets, SCALES, strict=False)
+    ]
+    *finer, coarsest = levels
+    trials = [_align(*coarsest, _ahead(start, metres), ITERATIONS, CONVERGED, _DAMPING) for metres in STARTS]
+    _, motion = min(trials, key=lambda trial: trial[0])
+    for level in reversed(finer):
+        _, motion = _align(*level, motion, ITERATIONS, CONVERGED, _DAMPING)
+    return motion
+
+
+def _ahead(motion: NDArray[np.float64], metres: float) -> NDArray[np.float64]:
+    """``motion``, and then this many metres along the optical axis."""
+    ahead = motion.copy()
+    ahead[2, 3] -= metres
+    return ahead
+
+
+def _mean_rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean rotation matrix on the way to a rotation vector: ``t = V v`` in the SE(3) exponential."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-4:
+        return np.eye(3) + cross / 2 + cross @ cross / 6
+    cosine = (1 - math.cos(angle)) / angle**2
+    sine = (angle - math.sin(angle)) / angle**3
+    return np.eye(3) + cosine * cross + sine * cross @ cross
+
+
+def _intrinsics(camera: Camera, rows: int) -> NDArray[np.float64]:
+    """``fx, fy, cx, cy`` of the camera at the pyramid level with this many rows."""
+    factor = 2.0 ** round(math.log2(camera.height / rows))
+    return np.array(
+        [
+            camera.fx / factor,
+            camera.fy / factor,
+            (camera.cx + 0.5) / factor - 0.5,
+            (camera.cy + 0.5) / factor - 0.5,
+        ]
+    )
+
+
+def _pyramid(image: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Box-averaged halvings, finest first; a plane's inverse depth stays exact when averaged."""
+    while image.shape[1] > FINEST_WIDTH:
+        image = _halved(image)
+    levels = [image]
+    while len(levels) < len(SCALES) and min(levels[-1].shape) >= 16:
+        levels.append(_halved(levels[-1]))
+    return levels
+
+
+def _halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    image = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    return np.float32(0.25) * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
+
+
+@njit(cache=True, error_model="numpy")
+def _align(source, target, intrinsics, scale, stride, motion, iterations, converged, damping):  # type: ignore[no-untyped-def]
+    """Gauss-Newton at one level; the best cost seen and its motion."""
+    best_cost, best = np.inf, motion
+    for _ in range(iterations):
+        cost, normal, gradient = _normal_equations(source, target, intrinsics, scale, stride, motion)
+        if cost < best_cost:
+            best_cost, best = cost, motion
+        for k in range(6):
+            normal[k, k] += damping[k]
+        step = _solved(normal, gradient)
+        longest = 0.0
+        for k in range(6):
+            longest = max(longest, abs(step[k]))
+        if longest < converged:
+            break
+        motion = _stepped(motion, step)
+    return best_cost, best
+
+
+@njit(cache=True, error_model="numpy")
+def _solved(normal, gradient):  # type: ignore[no-untyped-def]
+    """``normal^-1 gradient`` for a positive definite matrix, by elimination in place."""
+    size = gradient.size
+    for k in range(size):
+        for row in range(k + 1, size):
+            factor = normal[row, k] / normal[k, k]
+            for column in range(k, size):
+                normal[row, column] -= factor * normal[k, column]
+            gradient[row] -= factor * gradient[k]
+    for k in range(size - 1, -1, -1):
+        for column in range(k + 1, size):
+            gradient[k] -= normal[k, column] * gradient[column]
+        gradient[k] /= normal[k, k]
+    return gradient
+
+
+@njit(cache=True, error_model="numpy")
+def _stepped(motion, step):  # type: ignore[no-untyped-def]
+    """``motion``, then a small translation and rotation (the unit quaternion along ``(1, step / 2)``)."""
+    x, y, z = 0.5 * step[3], 0.5 * step[4], 0.5 * step[5]
+    s = 2.0 / (1.0 + x * x + y * y + z * z)
+    moved = motion.copy()
+    for k in range(4):
+        a, b, c = motion[0, k], motion[1, k], motion[2, k]
+        moved[0, k] += s * (-(y * y + z * z) * a + (x * y - z) * b + (x * z + y) * c)
+        moved[1, k] += s * ((x * y + z) * a - (x * x + z * z) * b + (y * z - x) * c)
+        moved[2, k] += s * ((x * z - y) * a + (y * z + x) * b - (x * x + y * y) * c)
+    for k in range(3):
+        moved[k, 3] += step[k]
+    return moved
+
+
+@njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
+def _normal_equations(source, target, intrinsics, scale, stride, motion):  # type: ignore[no-untyped-def]
+    """Robust cost, ``J^T W J`` and ``-J^T W r`` of one level, for a small motion applied on the left.
+
+    All three are means over the pixels that stay in view. The cost is Geman-McClure's, in [0, 1];
+    it is 1 (and the step 0) when less than a quarter of the image stays in view.
+    """
+    height, width = source.shape
+    fx, fy, cx, cy = intrinsics
+    r00, r01, r02, tx = motion[0]
+    r10, r11, r12, ty = motion[1]
+    r20, r21, r22, tz = motion[2]
+    cost = 0.0
+    seen = 0
+    normal = np.zeros((6, 6))
+    gradient = np.zeros(6)
+    jacobian = np.empty(6)
+    for y in range(0, height, stride):
+        ray_y = (y - cy) / fy
+        for x in range(0, width, stride):
+            ray_x = (x - cx) / fx
+            # The moved point, times its old inverse depth: finite for the sky.
+            w = source[y, x]
+            px = r00 * ray_x + r01 * ray_y + r02 + w * tx
+            py = r10 * ray_x + r11 * ray_y + r12 + w * ty
+            pz = r20 * ray_x + r21 * ray_y + r22 + w * tz
+            if pz < 0.1:
+                continue
+            u = px / pz
+            v = py / pz
+            column = u * fx + cx
+            row = v * fy + cy
+            if not (0 <= column < width - 1 and 0 <= row < height - 1):
+                continue
+            # Inverse depth found there, and its slope, bilinear.
+            i = int(column)
+            j = int(row)
+            a = column - i
+            b = row - j
+            top = target[j, i + 1] - target[j, i]
+            bottom = target[j + 1, i + 1] - target[j + 1, i]
+            left = target[j + 1, i] - target[j, i]
+            slope_u = fx * (top + b * (bottom - top))
+            slope_v = fy * (left + a * (bottom - top))
+            found = target[j, i] + a * top + b * left + a * b * (bottom - top)
+            moved = w / pz
+            size = 1.0 / (found + moved + _SKY)
+            residual = (found - moved) * size
+            # How found - moved changes when the point shifts by (dx, dy, dz) times its depth.
+            dx = slope_u * size
+            dy = slope_v * size
+            dz = moved * size - dx * u - dy * v
+            jacobian[0] = dx * moved
+            jacobian[1] = dy * moved
+            jacobian[2] = dz * moved
+            jacobian[3] = dz * v - dy
+            jacobian[4] = dx - dz * u
+            jacobian[5] = dy * u - dx * v
+            inlier = 1.0 / (1.0 + (residual / scale) ** 2)
+            cost += 1.0 - inlier
+            seen += 1
+            weight = inlier * inlier
+            for k in range(6):
+                weighted = weight * jacobian[k]
+                gradient[k] -= weighted * residual
+                for m in range(k + 1):
+                    normal[k, m] += weighted * jacobian[m]
+    for k in range(6):
+        for m in range(k):
+            normal[m, k] = normal[k, m]
+    if seen * stride**2 < source.size / 4:
+        return 1.0, np.zeros((6, 6)), np.zeros(6)
+    return cost / seen, normal / seen, gradient / seen

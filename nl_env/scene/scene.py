@@ -1,0 +1,170 @@
+"""A drive: traffic, world, weather and camera of one sequence, renderable at any microsecond."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from nl_env.config import WEATHERS, SceneConfig
+from nl_env.scene import models, weather, world
+from nl_env.scene.kernels import FAST
+from nl_env.scene.quads import Objects, Quads, join
+from nl_env.scene.rain import Rain
+from nl_env.scene.render import Renderer
+from nl_env.scene.traffic import Actor, simulate
+from nl_env.types import Camera
+
+MIX = (
+    ("intersection",) * 6 + ("highway",) * 4 + ("roundabout",) * 3 + ("two-way",) * 3
+    + ("merge",) * 3 + ("exit",) * 3 + ("u-turn",) * 2
+)  # fmt: skip
+"""The benchmark's scenarios, in the proportions that match the published figures."""
+_STYLES_OF = {"highway": ("rural", "suburb"), "merge": ("rural", "suburb"), "exit": ("rural",)}
+_TOWN_STYLES = ("downtown", "suburb", "park")
+_TWIST_STEP_US = 500
+
+
+@njit(**FAST)
+def _pose_actors(template, objects, states, moving, centres):
+    """Turn every actor's quads from its own frame into the world."""
+    for m in range(states.shape[0]):
+        x, y = states[m, 0], states[m, 1]
+        cos, sin = math.cos(states[m, 2]), math.sin(states[m, 2])
+        centres[0, m], centres[1, m] = x, y
+        for q in range(objects.first[m], objects.first[m] + objects.size[m]):
+            for source, target in (
+                (template.origin, moving.origin), (template.u, moving.u),
+                (template.v, moving.v), (template.normal, moving.normal),
+            ):  # fmt: skip
+                a, b = source[0, q], source[1, q]
+                target[0, q] = cos * a - sin * b
+                target[1, q] = sin * a + cos * b
+            moving.origin[0, q] += x
+            moving.origin[1, q] += y
+
+
+def _actor_model(actor: Actor, rng: np.random.Generator) -> Quads:
+    if actor.kind == "pedestrian":
+        return models.pedestrian(rng, actor.height)
+    make = models.truck if actor.kind == "truck" else models.car
+    return make(rng, actor.length, actor.width, actor.height)
+
+
+class DrivingScene:
+    """One sequence's scene; everything follows from the configuration, the camera and the seed.
+
+    Args:
+        config: which world; ``None`` fields are drawn with the seed.
+        camera: intrinsics of the pixel-aligned event camera and LiDAR.
+        seed: sequence seed, a non-negative integer.
+    """
+
+    def __init__(self, config: SceneConfig, camera: Camera, seed: int) -> None:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0,)))
+        drawn = str(rng.choice(MIX))
+        self.scenario = config.scenario or drawn
+        self.style = config.style or str(rng.choice(_STYLES_OF.get(self.scenario, _TOWN_STYLES)))
+        drawn = str(rng.choice(WEATHERS))
+        self.weather = config.weather or drawn
+        self.seed = seed
+        self._config = config
+        self.traffic = simulate(self.scenario, seed, config.duration_s)
+        conditions = weather.preset(self.weather)
+        built = world.build(self.traffic, self.style, conditions, camera.fx, rng)
+        azimuth = float(rng.uniform(0, 2 * np.pi))
+        parts = [_actor_model(actor, rng) for actor in self.traffic.actors]
+        self._template = world.light(join(parts), conditions, azimuth)
+        self._moving = Quads(*(np.array(field) for field in self._template))
+        sizes = np.array([p.count for p in parts], np.int32)
+        count = len(parts)
+        self._actors = Objects(
+            np.zeros((3, count), np.float32),
+            np.array([math.hypot(a.length, a.width, a.height) / 2 for a in self.traffic.actors], np.float32),
+            (np.cumsum(sizes) - sizes).astype(np.int32),
+            sizes,
+        )
+        self._actors.centre[2] = [a.height / 2 for a in self.traffic.actors]
+        self._renderer = Renderer(
+            camera, (built.quads, built.objects), built.ground, conditions.light(), self._template.count, count
+        )
+        self._rain = Rain(conditions.streaks, camera, int(rng.integers(2**31)))
+        self._phases = rng.uniform(0, 2 * np.pi, 6)
+        self.noise_scale = conditions.noise_scale
+
+    def render(self, t_us: int, intensity: NDArray[np.float32], depth: NDArray[np.float32] | None = None) -> None:
+        """Render the instant ``t_us``.
+
+        Args:
+            t_us: time, us.
+            intensity: ``(H, W)`` float32, filled with gamma-coded grey in [0.001, 1].
+            depth: ``(H, W)`` float32, filled with z-depth in metres, 0 where nothing is within 200 m.
+        """
+        states = self.traffic.actor_states(t_us)
+        _pose_actors(self._template, self._actors, states, self._moving, self._actors.centre)
+        self._renderer.render(self.pose(t_us), (self._moving, self._actors), intensity, depth)
+        self._rain.draw(t_us, intensity)
+
+    def pose(self, t_us: int) -> NDArray[np.float64]:
+        """``(4, 4)`` camera to world. The body pitches and rolls with the road and dives under braking."""
+        ego = self.traffic.ego(t_us)
+        t = t_us * 1e-6
+        shake = self._config.vibration * min(1.0, ego.speed / 8.0)
+        a = self._phases
+        wave = lambda hz, i: math.sin(2 * math.pi * hz * t + a[i])  # noqa: E731
+        pitch = shake * (0.18 * wave(1.3, 0) + 0.08 * wave(3.1, 1) + 0.025 * wave(9.0, 2))
+        pitch -= 0.25 * self._config.vibration * min(max(ego.acceleration, -4.0), 4.0)
+        roll = shake * (0.15 * wave(0.9, 3) + 0.06 * wave(4.3, 4))
+        return camera_pose(
+            np.array([ego.x, ego.y, self._config.camera_height + 0.015 * shake * wave(1.4, 5)]),
+            ego.heading,
+            math.radians(pitch),
+            math.radians(roll),
+        )
+
+    def twist(self, t_us: int) -> NDArray[np.float64]:
+        """``(6,)`` camera-frame linear (m/s) and angular (rad/s) velocity, from poses 1 ms apart."""
+        before, after = self.pose(max(t_us - _TWIST_STEP_US, 0)), self.pose(t_us + _TWIST_STEP_US)
+        dt = (t_us + _TWIST_STEP_US - max(t_us - _TWIST_STEP_US, 0)) * 1e-6
+        rotation = self.pose(t_us)[:3, :3]
+        spin = before[:3, :3].T @ after[:3, :3] / dt
+        linear = rotation.T @ (after[:3, 3] - before[:3, 3]) / dt
+        return np.array([*linear, spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]]) * (
+            1, 1, 1, 0.5, 0.5, 0.5
+        )  # fmt: skip
+
+    def speed(self, t_us: int) -> float:
+        """Ego speed, m/s."""
+        return float(self.traffic.ego(t_us).speed)
+
+    def shortest_distance(self, t_us: int) -> float:
+        """From the ego's outline to the nearest moving actor's, m; ``inf`` when there is none."""
+        return float(self.traffic.shortest_distance(t_us))
+
+    def actor_centres(self, t_us: int) -> NDArray[np.float64]:
+        """``(n, 4)``: x, y, z of each moving actor's centre and half its height, m."""
+        states = self.traffic.actor_states(t_us)
+        half = np.array([actor.height / 2 for actor in self.traffic.actors]).reshape(-1)
+        return np.stack([states[:, 0], states[:, 1], half, half], 1)
+
+    def describe(self) -> dict[str, Any]:
+        """Scenario, style, weather and seed."""
+        return {"scenario": self.scenario, "style": self.style, "weather": self.weather, "seed": self.seed}
+
+
+def camera_pose(position: NDArray[np.float64], heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Camera-to-world pose of a forward-looking camera; positive pitch looks down, angles in radians."""
+    forward = np.array(
+        [math.cos(heading) * math.cos(pitch), math.sin(heading) * math.cos(pitch), -math.sin(pitch)]
+    )
+    right = np.array([math.sin(heading), -math.cos(heading), 0.0])
+    down = np.cross(forward, right)
+    pose = np.eye(4)
+    pose[:3, 0] = math.cos(roll) * right + math.sin(roll) * down
+    pose[:3, 1] = -math.sin(roll) * right + math.cos(roll) * down
+    pose[:3, 2] = forward
+    pose[:3, 3] = position
+    return pose

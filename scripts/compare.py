@@ -1,0 +1,220 @@
+"""Compare trigger policies on test sequences: a table, error-against-rate curves, and a page to look at.
+
+Every finished sequence is kept in the output folder, so an interrupted run continues with --resume.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # agents/ is used from the checkout, wherever the command is started
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
+from agents.oracle import oracle_curve
+from nl_env.comparison import PolicyInfo, SequenceResult, compare, evaluate_sequence
+from nl_env.config import (
+    SPLITS,
+    DrivingConfig,
+    EventCameraConfig,
+    LidarConfig,
+    SceneConfig,
+    number,
+)
+from nl_env.depth.extrapolators import make_extrapolator
+from nl_env.evaluation import EnergyModel
+from nl_env.report import write_report
+from nl_env.runs import open_folder, run_sequences
+from nl_env.streams import SyntheticStream
+from nl_env.tables import text_report
+from nl_env.traces import trace_sequence
+
+SEQUENCES_PER_SEED = 1_000
+"""Runs of different --seed share no sequence."""
+
+ENDPOINTS = ("never", "always")
+"""Always compared: the ends of every curve; "always" is also the all-positive keyframe detector."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What determines the results."""
+
+    sequences: int = 8
+    """Number of test sequences."""
+    duration: float = 20.0
+    """Length of each, seconds."""
+    seed: int = 0
+    """Which test sequences; another seed gives others. Also seeds the bootstrap."""
+    resolution: str = "quarter"
+    """full (480x640), half (240x320) or quarter (120x160)."""
+    lidar_hz: int = 10
+    """LiDAR frames per second: 1, 2, 5, 10 or 25."""
+    noise: str = "realistic"
+    """Event camera: realistic or ideal."""
+    extrapolator: str = "warp"
+    """repeat, linear, exponential, warp, unet, unet-paper, or a path to weights."""
+    odometry: bool = False
+    """Give the extrapolator the true ego motion."""
+    policies: tuple[str, ...] = (
+        "periodic:2",
+        "random:0.5",
+        "event-rate",
+        "event-rate-hysteresis",
+        "keyframe-rule",
+        "greedy",
+        "oracle:20",
+        "oracle:30",
+        "oracle:40",
+    )
+    """Rows of the table beside never and always: FAMILY or FAMILY:NUMBER. Families: periodic (every n-th
+    slice), random (probability), event-rate and event-rate-hysteresis (share of active pixels),
+    keyframe-rule, greedy (log_mae of holding), oracle (effective rate, Hz)."""
+    sweep: bool = True
+    """Also vary each family's number, which draws the curves."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` naming the option, what was found and what was expected."""
+        number("sequences", self.sequences, 1, SEQUENCES_PER_SEED)
+        number("seed", self.seed, 0, len(SPLITS["test"]) // SEQUENCES_PER_SEED - 1)
+        self.config  # noqa: B018 - validates the rest
+        for name in self.policies:
+            make_policy(name, seed=0)
+
+    @property
+    def config(self) -> DrivingConfig:
+        """The synthetic stream's configuration."""
+        return DrivingConfig(
+            resolution=self.resolution,
+            scene=SceneConfig(duration_s=self.duration),
+            events=EventCameraConfig.preset(self.noise),
+            lidar=LidarConfig(rate_hz=self.lidar_hz),
+        )
+
+    @property
+    def sequence_seeds(self) -> range:
+        """Seeds of the test sequences; the page plays the first."""
+        first = self.seed * SEQUENCES_PER_SEED
+        return SPLITS["test"][first : first + self.sequences]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare trigger policies on test sequences."""
+
+    settings: Annotated[Settings, tyro.conf.OmitArgPrefixes]
+    workers: int = os.cpu_count() or 1
+    """Processes of one thread each; 0 runs in this one. The results do not depend on it."""
+    out: Path = Path("runs/compare")
+    """Output folder: results.json, table.md, figures, report.html, and the finished sequences."""
+    overwrite: bool = False
+    """Replace the run that is in the output folder."""
+    resume: bool = False
+    """Continue the run that is in the output folder; the settings must be the same."""
+    json: bool = False
+    """Print results.json instead of the table."""
+
+
+def policy_infos(settings: Settings) -> list[PolicyInfo]:
+    """The table's policies, then the sweeps of their families."""
+    listed = [parse_policy(name) for name in (*ENDPOINTS, *settings.policies)]
+    families = dict.fromkeys(family for family, _ in listed)
+    swept = [(family, float(value)) for family in families for value in FAMILIES[family].sweep]
+    chosen = dict.fromkeys([*listed, *(swept if settings.sweep else [])])
+    return [
+        PolicyInfo(
+            name=policy_name(family, parameter),
+            family=family,
+            parameter=parameter,
+            listed=(family, parameter) in listed,
+            adaptive=FAMILIES[family].adaptive,
+            privileged=make_policy(policy_name(family, parameter), seed=0).privileged,
+        )
+        for family, parameter in chosen
+    ]
+
+
+@dataclass(frozen=True)
+class CompareSequence:
+    """The work of one process: one sequence with every policy."""
+
+    settings: Settings
+
+    def __call__(self, seed: int) -> SequenceResult:
+        """Run the sensors once, then play every policy on what they saw."""
+        settings = self.settings
+        stream = SyntheticStream(settings.config)
+        extrapolator = make_extrapolator(settings.extrapolator, odometry=settings.odometry)
+        first = seed == settings.sequence_seeds[0]
+        trace = trace_sequence(stream, extrapolator, seed, keep_frames=first)
+        stream.close()
+        policies = {info.name: make_policy(info.name, seed) for info in policy_infos(settings)}
+        energy = EnergyModel(lidar_frame_j=settings.config.lidar.energy_mj / 1000)
+        return evaluate_sequence(trace, policies, least_errors, energy)
+
+
+def least_errors(errors: Any, period: int) -> Any:
+    """The optimal oracle's least total error for 0..N triggers."""
+    return oracle_curve(errors, period)[1]
+
+
+def run(options: Options) -> dict[str, Any]:
+    """Evaluate, write the report, print it, and return the content of ``results.json``."""
+    settings = options.settings
+    settings.validate()
+    make_extrapolator(settings.extrapolator, odometry=settings.odometry)  # a wrong name fails before the work
+    checkpoints = open_folder(
+        options.out, asdict(settings), overwrite=options.overwrite, resume=options.resume
+    )
+    with tqdm(total=settings.sequences, desc="sequences", unit="sequence", disable=None) as bar:
+        results = run_sequences(
+            CompareSequence(settings),
+            SequenceResult.load,
+            settings.sequence_seeds,
+            checkpoints,
+            workers=options.workers,
+            progress=bar.update,
+        )
+    comparison = compare(
+        asdict(settings), policy_infos(settings), results, np.random.default_rng(settings.seed)
+    )
+    written = write_report(comparison, options.out)
+    if options.json:
+        print(json.dumps(written, indent=1, allow_nan=False))
+    else:
+        print(text_report(comparison))
+        print("* privileged: reads what no sensor gives. Columns: see table.md beside the page.")
+        print(f"page: {(options.out / 'report.html').resolve().as_uri()}")
+    return written
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        options = tyro.cli(Options, args=arguments, description=__doc__)
+        run(options)
+    except (ValueError, OSError) as error:
+        print(f"compare: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
+        command = shlex.join(["python", "scripts/compare.py", *again, "--resume"])
+        print(f"\ninterrupted; finished sequences are kept. Continue with: {command}", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,112 @@
+import json
+
+import pytest
+
+from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
+from scripts import compare
+
+SHORT = (
+    "--sequences 3 --duration 0.4 --extrapolator repeat --policies periodic:2 event-rate --workers 0".split()
+)
+
+
+def run(folder, *more):
+    return compare.main([*SHORT, "--out", str(folder), *more])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare") / "run"
+    assert run(folder) == 0
+    return folder
+
+
+def test_one_command_writes_the_whole_report(finished):
+    assert {path.name for path in finished.iterdir()} == {
+        "results.json",
+        "table.md",
+        "report.html",
+        "error_vs_rate.png",
+        "rate_vs_time.png",
+        "rate_vs_speed.png",
+        "settings.json",
+        "sequences",
+    }
+    found = json.loads((finished / "results.json").read_text())
+    listed = [policy["name"] for policy in found["policies"] if policy["listed"]]
+    assert listed == ["never", "always", "periodic:2", "event-rate:0.15"]
+    assert [sequence["seed"] for sequence in found["sequences"]] == [2_000_000_000 + i for i in range(3)]
+    always = found["policies"][1]
+    assert always["recall"]["mean"] in (1.0, None)
+    assert always["rate"]["mean"] == pytest.approx(50.0)
+
+
+def test_an_interrupted_run_resumes_to_the_same_bytes(finished, tmp_path, monkeypatch, capsys):
+    trace_sequence = compare.trace_sequence
+
+    def interrupted(stream, extrapolator, seed, **more):
+        if seed == 2_000_000_001:
+            raise KeyboardInterrupt
+        return trace_sequence(stream, extrapolator, seed, **more)
+
+    monkeypatch.setattr(compare, "trace_sequence", interrupted)
+    assert run(tmp_path / "run") == 130
+    assert "--resume" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "results.json").exists()
+    monkeypatch.setattr(compare, "trace_sequence", trace_sequence)
+    assert run(tmp_path / "run", "--resume", "--json") == 0
+    printed = capsys.readouterr()
+    results = (finished / "results.json").read_bytes()
+    assert (tmp_path / "run" / "results.json").read_bytes() == results
+    assert json.loads(printed.out) == json.loads(results)
+    assert printed.err == ""  # no progress bar without a terminal
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--policies", "sometimes"], "policy: found 'sometimes', expected one of 'never', 'always'"),
+        (["--policies", "never:2"], "has no parameter"),
+        (["--policies", "random:often"], "expected random:NUMBER (probability)"),
+        (["--policies", "random:1.5"], "p: found 1.5"),
+        (["--policies", "periodic:2.5"], "expected a whole number"),
+        (["--resolution", "tiny"], "resolution: found 'tiny', expected one of 'full', 'half', 'quarter'"),
+        (["--extrapolator", "magic"], "'magic'"),
+        (["--sequences", "0"], "sequences: found 0"),
+        (["--seed", "-1"], "seed: found -1"),
+        (["--overwrite", "--resume"], "expected at most one"),
+    ],
+)
+def test_bad_options_are_refused_before_any_work(tmp_path, capsys, arguments, message):
+    assert compare.main([*arguments, "--out", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_finished_run_is_not_overwritten_unasked(finished, capsys):
+    before = (finished / "results.json").read_bytes()
+    assert run(finished) == 2
+    assert "already holds another run" in capsys.readouterr().err
+    assert run(finished, "--resume", "--duration", "0.6") == 2
+    assert "other settings: duration" in capsys.readouterr().err
+    assert (finished / "results.json").read_bytes() == before
+
+
+def test_help_documents_every_option(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        compare.main(["--help"])
+    text = capsys.readouterr().out
+    for (
+        option
+    ) in "sequences duration seed resolution extrapolator policies workers out json overwrite resume".split():
+        assert f"--{option}" in text
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_and_its_sweep_can_be_made(family):
+    for value in FAMILIES[family].sweep:
+        name = policy_name(family, value)
+        assert parse_policy(name) == (family, value)
+        make_policy(name, seed=0)
+    assert parse_policy(family)[0] == family
+    make_policy(family, seed=0)

@@ -1,0 +1,147 @@
+import json
+import re
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_evaluation import POLICIES, infos, results
+
+from nl_env.comparison import compare
+from nl_env.depth.metrics import METRIC_NAMES
+from nl_env.report import write_report
+from nl_env.tables import text_report
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return compare({"extrapolator": "approach <fast>"}, infos(), results(), np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def folder(comparison, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    write_report(comparison, folder)
+    return folder
+
+
+def test_results_json_holds_every_number(comparison, folder):
+    found = json.loads(
+        (folder / "results.json").read_text(), parse_constant=pytest.fail
+    )  # no NaN, no Infinity
+    assert [policy["name"] for policy in found["policies"]] == list(POLICIES)
+    for policy, summary in zip(found["policies"], comparison.summaries, strict=True):
+        assert set(policy["held"]) == set(policy["produced"]) == set(METRIC_NAMES)
+        assert policy["held"]["log_mae"]["mean"] == summary.held["log_mae"].mean
+        assert np.mean(policy["per_sequence"]["error"]) == pytest.approx(summary.held["log_mae"].mean)
+        assert policy["rate"]["min"] <= policy["rate"]["mean"] <= policy["rate"]["max"]
+    assert found["policies"][0]["produced"]["log_mae"]["mean"] is None  # "never" produced nothing
+    assert found["floor"]["rate"][0] == pytest.approx(10.0)
+    assert np.all(np.diff(found["floor"]["rate"]) > 0)
+
+
+def test_the_schema_document_names_every_field(folder):
+    schema = Path(__file__).parents[1] / "docs" / "results-schema.md"
+    documented = set(re.findall(r"`(\w+)`", schema.read_text(encoding="utf-8")))
+    found = json.loads((folder / "results.json").read_text())
+    fields = {*found, *found["sequences"][0], *found["policies"][0], *METRIC_NAMES}
+    assert fields <= documented
+
+
+def test_tables_show_the_same_numbers(comparison, folder):
+    text = text_report(comparison).splitlines()
+    assert len({len(line) for line in text}) == 1
+    periodic = comparison.summaries[2].held["log_mae"].mean
+    row = next(line for line in text if line.startswith("periodic:3"))
+    assert f"{periodic:.4f}" in row.split()
+    markdown = (folder / "table.md").read_text()
+    assert re.search(rf"\| periodic:3 \|.*\| {periodic:.4f} \|", markdown)
+
+
+@pytest.mark.parametrize("name", ["error_vs_rate", "rate_vs_time", "rate_vs_speed"])
+def test_figures_are_drawn(folder, name):
+    image = np.asarray(Image.open(folder / f"{name}.png").convert("RGB")).astype(int)
+    assert image.shape[1] > 800
+    coloured = np.ptp(image, axis=2) > 60
+    assert coloured.sum() > 1000  # curves, not only axes
+
+
+def test_same_comparison_same_bytes(comparison, folder, tmp_path):
+    write_report(comparison, tmp_path)
+    for path in folder.iterdir():
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
+
+
+def test_the_page_asks_for_nothing_outside_itself(folder):
+    page = (folder / "report.html").read_text()
+    assert not re.search(
+        r"""(?:src|href)\s*=\s*["'](?!data:)|url\(|@import|https?://(?!www\.w3\.org)""", page
+    )
+
+
+@pytest.fixture
+def browser(tmp_path):
+    chromium, driver = shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("needs chromium and chromedriver")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in (
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+        "--window-size=1280,1600",
+        f"--user-data-dir={tmp_path / 'profile'}",
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    with webdriver.Chrome(options=options, service=webdriver.ChromeService(driver)) as browser:
+        yield browser
+
+
+def wait_for(browser, condition):
+    deadline = time.monotonic() + 20
+    while not browser.execute_script(f"return {condition}"):
+        assert time.monotonic() < deadline, f"never true: {condition}"
+        time.sleep(0.05)
+
+
+def test_the_page_works_in_a_browser(folder, browser):
+    browser.get((folder / "report.html").as_uri())
+    wait_for(browser, "document.body.dataset.ready === 'true'")
+    slice_shown = "Number(document.getElementById('slider').value)"
+    held = "document.getElementById('held-0').toDataURL()"
+
+    first, before = browser.execute_script(f"return {slice_shown}"), browser.execute_script(f"return {held}")
+    browser.find_element("id", "play").click()
+    wait_for(browser, f"{slice_shown} > {first} + 5")
+    wait_for(browser, f"{held} !== {json.dumps(before)}")
+    browser.find_element("id", "play").click()
+    stopped = browser.execute_script(f"return {slice_shown}")
+    time.sleep(0.3)
+    assert browser.execute_script(f"return {slice_shown}") == stopped
+
+    # Policy B becomes "always": at any slice it holds that slice's own frame.
+    browser.execute_script("const s = document.getElementById('policy-1'); s.value = 'always'; s.onchange()")
+    assert "0 ms" in browser.find_element("id", "readout-1").text
+
+    rows = browser.find_elements("css selector", "#table tbody tr")
+    assert [row.find_element("css selector", "td").text for row in rows] == list(POLICIES)
+    assert browser.find_elements("css selector", "#error-chart circle")
+    assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []
+
+
+def test_the_browser_would_report_a_broken_page(folder, browser, tmp_path):
+    page = (folder / "report.html").read_text().replace("drawHeader();\ndrawCharts();", "drawNothing();")
+    broken = tmp_path / "broken.html"
+    broken.write_text(page)
+    browser.get(broken.as_uri())
+    assert any(entry["level"] == "SEVERE" for entry in browser.get_log("browser"))
