@@ -74,7 +74,7 @@ def draw_rate_over_time(comparison: Comparison, figure: Figure) -> None:
         name = comparison.policies[i].name
         above.plot(seconds[1:], rate_over_time(result, i), color=colour, ls=dashes, lw=1.3, label=name)
     above.set(ylabel="effective frame rate (Hz)", ylim=(0, 1e6 / SLICE_US * 1.04))
-    above.legend(frameon=False, fontsize=8, ncols=3)
+    above.legend(frameon=False, fontsize=8, ncols=4, loc="lower left", bbox_to_anchor=(0, 1))
     below.fill_between(seconds, result.ego_speed, color=NEUTRAL, alpha=0.35, lw=0)
     below.set(xlabel="time (s)", ylabel="ego speed (m/s)", xlim=(0, seconds[-1]), ylim=(0, None))
 

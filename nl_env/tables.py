@@ -26,10 +26,10 @@ _COLUMNS: tuple[tuple[str, Callable[[PolicySummary, Estimate, float], str]], ...
     ("rate Hz", lambda s, saved, above: _cell(s.rate, 1)),
     ("min-max", lambda s, saved, above: f"{s.rate_min:.0f}-{s.rate_max:.0f}"),
     (DECIDING_METRIC, lambda s, saved, above: _cell(s.held[DECIDING_METRIC], 4)),
-    ("95 %", lambda s, saved, above: f"{s.held[DECIDING_METRIC].low:.4f}-{s.held[DECIDING_METRIC].high:.4f}"),
-    ("saved", lambda s, saved, above: f"{saved.mean:.4f}"),
-    ("95 %", lambda s, saved, above: f"{saved.low:.4f}-{saved.high:.4f}"),
-    ("above floor", lambda s, saved, above: f"{max(above, 0):.4f}"),
+    ("95 %", lambda s, saved, above: _interval(s.held[DECIDING_METRIC])),
+    ("saved", lambda s, saved, above: _cell(saved, 4)),
+    ("95 %", lambda s, saved, above: _interval(saved)),
+    ("above floor", lambda s, saved, above: _fixed(above, 4)),
     ("imae 1/km", lambda s, saved, above: _cell(s.held["imae"], 2)),
     ("bad_25", lambda s, saved, above: _cell(s.held["bad_25"], 3)),
     ("rmse m", lambda s, saved, above: _cell(s.held["rmse"], 2)),
@@ -108,7 +108,16 @@ def _metric_rows(
 
 
 def _cell(estimate: Estimate, digits: int) -> str:
-    return f"{estimate.mean:.{digits}f}" if math.isfinite(estimate.mean) else "-"
+    return _fixed(estimate.mean, digits) if math.isfinite(estimate.mean) else "-"
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{_fixed(estimate.low, 4)}-{_fixed(estimate.high, 4)}"
+
+
+def _fixed(value: float, digits: int) -> str:
+    """Decimals without a negative zero."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:

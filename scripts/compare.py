@@ -21,6 +21,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+import nl_env
 from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
 from agents.oracle import oracle_curve
 from nl_env.comparison import PolicyInfo, SequenceResult, compare, evaluate_sequence
@@ -174,9 +175,8 @@ def run(options: Options) -> dict[str, Any]:
     settings = options.settings
     settings.validate()
     make_extrapolator(settings.extrapolator, odometry=settings.odometry)  # a wrong name fails before the work
-    checkpoints = open_folder(
-        options.out, asdict(settings), overwrite=options.overwrite, resume=options.resume
-    )
+    identity = {"version": nl_env.__version__, **asdict(settings)}  # no run mixes versions
+    checkpoints = open_folder(options.out, identity, overwrite=options.overwrite, resume=options.resume)
     with tqdm(total=settings.sequences, desc="sequences", unit="sequence", disable=None) as bar:
         results = run_sequences(
             CompareSequence(settings),

@@ -23,7 +23,7 @@ LAYERS = (
     ("driving", "indoor_env", "replay"),
     ("wrappers",),
     ("traces", "runs"),
-    ("evaluation",),
+    ("evaluation", "realism"),
     ("comparison",),
     ("tables", "plots"),
     ("page",),

@@ -47,6 +47,15 @@ class Quads(NamedTuple):
         """Number of parallelograms."""
         return self.albedo.shape[0]
 
+    def packed(self) -> Float:
+        """``(N, raster.PACKED)`` float32, one row per quad, as the renderer reads it."""
+        flags = [np.asarray(f, np.float32)[None] for f in (self.texture, self.cutout, self.two_sided)]
+        rows = (
+            self.origin, self.u, self.v, self.normal, self.albedo[None], flags[0], self.repeat, self.shift,
+            self.density[None], flags[1], flags[2],
+        )  # fmt: skip
+        return np.ascontiguousarray(np.concatenate(rows).T, np.float32)
+
 
 class Objects(NamedTuple):
     """Runs of quads that are culled together.

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from nl_env.scene.kernels import FAST
+from nl_env.scene.raster import FAST
 from nl_env.types import Camera
 
 _REFERENCE_WIDTH = 640

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from nl_env.config import WEATHERS, SceneConfig
 from nl_env.scene import models, weather, world
-from nl_env.scene.kernels import FAST
 from nl_env.scene.quads import Objects, Quads, join
 from nl_env.scene.rain import Rain
+from nl_env.scene.raster import FAST, NORMAL, ORIGIN, U, V
 from nl_env.scene.render import Renderer
 from nl_env.scene.traffic import Actor, simulate
 from nl_env.types import Camera
@@ -29,22 +29,19 @@ _TWIST_STEP_US = 500
 
 
 @njit(**FAST)
-def _pose_actors(template, objects, states, moving, centres):
-    """Turn every actor's quads from its own frame into the world."""
+def _pose_actors(template, first, size, states, moving, centres):
+    """Turn every actor's packed quads from its own frame into the world."""
     for m in range(states.shape[0]):
         x, y = states[m, 0], states[m, 1]
         cos, sin = math.cos(states[m, 2]), math.sin(states[m, 2])
         centres[0, m], centres[1, m] = x, y
-        for q in range(objects.first[m], objects.first[m] + objects.size[m]):
-            for source, target in (
-                (template.origin, moving.origin), (template.u, moving.u),
-                (template.v, moving.v), (template.normal, moving.normal),
-            ):  # fmt: skip
-                a, b = source[0, q], source[1, q]
-                target[0, q] = cos * a - sin * b
-                target[1, q] = sin * a + cos * b
-            moving.origin[0, q] += x
-            moving.origin[1, q] += y
+        for q in range(first[m], first[m] + size[m]):
+            for column in (ORIGIN, U, V, NORMAL):
+                a, b = template[q, column], template[q, column + 1]
+                moving[q, column] = cos * a - sin * b
+                moving[q, column + 1] = sin * a + cos * b
+            moving[q, ORIGIN] += x
+            moving[q, ORIGIN + 1] += y
 
 
 def _actor_model(actor: Actor, rng: np.random.Generator) -> Quads:
@@ -77,8 +74,8 @@ class DrivingScene:
         built = world.build(self.traffic, self.style, conditions, camera.fx, rng)
         azimuth = float(rng.uniform(0, 2 * np.pi))
         parts = [_actor_model(actor, rng) for actor in self.traffic.actors]
-        self._template = world.light(join(parts), conditions, azimuth)
-        self._moving = Quads(*(np.array(field) for field in self._template))
+        self._template = world.light(join(parts), conditions, azimuth).packed()
+        self._moving = self._template.copy()
         sizes = np.array([p.count for p in parts], np.int32)
         count = len(parts)
         self._actors = Objects(
@@ -89,7 +86,7 @@ class DrivingScene:
         )
         self._actors.centre[2] = [a.height / 2 for a in self.traffic.actors]
         self._renderer = Renderer(
-            camera, (built.quads, built.objects), built.ground, conditions.light(), self._template.count, count
+            camera, (built.quads, built.objects), built.ground, conditions.light(), len(self._template), count
         )
         self._rain = Rain(conditions.streaks, camera, int(rng.integers(2**31)))
         self._phases = rng.uniform(0, 2 * np.pi, 6)
@@ -104,7 +101,9 @@ class DrivingScene:
             depth: ``(H, W)`` float32, filled with z-depth in metres, 0 where nothing is within 200 m.
         """
         states = self.traffic.actor_states(t_us)
-        _pose_actors(self._template, self._actors, states, self._moving, self._actors.centre)
+        _pose_actors(
+            self._template, self._actors.first, self._actors.size, states, self._moving, self._actors.centre
+        )
         self._renderer.render(self.pose(t_us), (self._moving, self._actors), intensity, depth)
         self._rain.draw(t_us, intensity)
 

@@ -51,10 +51,10 @@ class Style:
 
 
 STYLES: dict[str, Style] = {
-    "downtown": Style(15, (11, 17.5), 1.0, 300, 150.0, 0.45, 33, (3, 6.5), None, 0.02, 0.5, 0.35, 0.03, 0.0, True),
-    "suburb": Style(19, (20, 45), 0.75, 240, 130.0, 0.45, 27, (3.8, 15), (17, 55), 0.05, 0.5, 0.35, 0.1, 0.0, True),
-    "park": Style(19, (20, 45), 0.3, 240, 130.0, 0.45, 16, (3.8, 15), (17, 55), 0.05, 0.5, 0.35, 0.1, 0.0, True),
-    "rural": Style(19, (14, 40), 0.2, 200, 105.0, 0.12, 25, (5.5, 20), (15, 45), 0.05, 0.2, 0.0, 0.1, 0.25, False),
+    "downtown": Style(15, (11, 17.5), 1.0, 310, 155.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True),
+    "suburb": Style(19, (20, 45), 0.75, 250, 135.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True),
+    "park": Style(19, (20, 45), 0.3, 250, 135.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True),
+    "rural": Style(19, (14, 40), 0.2, 205, 108.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False),
 }
 _HIGHWAYS = ("highway", "merge", "exit")
 _TREE_LEVELS = (
@@ -209,7 +209,7 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
 
     b.add(b.variants(models.bush), *b.along(22, (2, 5), s.bush_share, 0.6), (0.6, 1.6), (0.25, 0.5))
     poles = [models.pole(rng, lamp=i % 3 > 0) for i in range(_VARIANTS)]
-    b.add(poles, *b.along(50, (0.5, 1.2), 0.9))
+    b.add(poles, *b.along(40, (0.5, 1.2), 0.9))
     b.add(b.variants(models.sign, 3), *b.along(45, (0.4, 1.2), 0.6, 0.5))
     b.add(b.variants(models.furniture), *b.along(25, (0.8, 3.2), s.furniture_share, 0.5))
     b.add(b.variants(models.fence), *b.along(5.2, (3.6, 4.4), s.fence_share, 0.0))

@@ -264,11 +264,14 @@ def _surviving(count, first, spacing, last, tick, times):
 
 @njit(cache=True, error_model="numpy")
 def _mark_crowded(count, first, spacing, last, tick, crowded):
-    """Mark pixels whose dead time may matter: events too dense, or the first too soon after the last one."""
+    """Mark pixels whose dead time may matter: the first event too soon after the last one, or all too dense.
+
+    Two microseconds of margin cover the truncation to whole microseconds and the clip to the tick.
+    """
     start, refractory, latest = i4(tick.start), i4(tick.refractory), f4(tick.length - 1)
     for j in range(count.size):
         soon = i4(i4(start + _moment(f4(0), first[j], spacing[j], latest)) - last[j]) < refractory
-        dense = (spacing[j] <= f4(refractory)) & (abs(count[j]) > f4(1))
+        dense = (spacing[j] <= f4(refractory + i4(2))) & (abs(count[j]) > f4(1))
         crowded[j] = (soon | dense) & (count[j] != f4(0))
 
 

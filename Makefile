@@ -1,0 +1,48 @@
+# make compare   compare trigger policies on test sequences: a table, curves, a page (no torch needed)
+# make test      ruff, mypy and the whole test suite
+# make bench     time every stage, write docs/performance.md
+# make realism   print how close the scenes are to the published figures
+# Every target first creates .venv and installs what it needs, once.
+
+PYTHON ?= python3
+WORKERS ?= 2
+BIN := .venv/bin
+COMPILING = find nl_env -name '*.nbi' | grep -q . || echo "compiling kernels, once (a minute or two)" >&2
+
+.PHONY: compare test lint bench realism clean
+.DELETE_ON_ERROR:
+
+compare: .venv/.report
+	@$(COMPILING)
+	$(BIN)/python scripts/compare.py --overwrite
+
+test: export NUMBA_NUM_THREADS := 1
+test: export OMP_NUM_THREADS := 1
+test: lint
+	@$(COMPILING)
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+lint: .venv/.dev
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+bench: .venv/.report
+	@$(COMPILING)
+	$(BIN)/python benchmarks/stages.py --json docs/performance.json --markdown docs/performance.md
+
+realism: .venv/.report
+	@$(COMPILING)
+	$(BIN)/python scripts/realism.py
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# .venv/.EXTRA records that the extra EXTRA of pyproject.toml is installed, at the tested versions.
+.venv/.%: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$*]'
+	touch $@
+
+$(BIN)/python:
+	$(PYTHON) -m venv .venv
