@@ -132,7 +132,7 @@ class SensorStream(Protocol):
     max_depth: float
 
     def reset(self, seed: int) -> Sample:
-        """Start the sequence of ``seed`` and return sample 0 (``t = 0``, with a LiDAR frame, without events)."""
+        """Start the sequence of ``seed``; return sample 0 (a LiDAR frame at ``t = 0``, no events)."""
         ...
 
     def advance(self) -> Sample:

@@ -1,4 +1,4 @@
-"""The authors' checkpoint as a probe: its error, its falsification controls, and the input of its batch norms."""
+"""The authors' checkpoint as a probe: its error, falsification controls, and the input of its batch norms."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def summarise(
     if not reports:
         raise ValueError("reports: found none, expected at least one world")
     probed = sum(r.probed for r in reports)
-    rates = np.array([effective_rate(r.keyframes.any(axis=1), lidar_period) for r in reports])
+    rates = np.array([effective_rate(r.labels, lidar_period) for r in reports])
     return Summary(
         worlds=len(reports),
         pairs=len(reports[0].speed),
@@ -235,7 +235,7 @@ def _keyframes(reports: Sequence[WorldReport], rates: NDArray[np.float64]) -> Ke
     found = max(int(causes.any(axis=1).sum()), 1)
     alone = causes & (causes.sum(axis=1, keepdims=True) == 1)
     return KeyframeSummary(
-        share=clustered_mean([r.keyframes.any(axis=1).astype(np.float64) for r in reports]),
+        share=clustered_mean([r.labels.astype(np.float64) for r in reports]),
         causes={name: float(causes[:, i].sum()) / found for i, name in enumerate(CAUSES)},
         alone={name: float(alone[:, i].sum()) / found for i, name in enumerate(CAUSES)},
         rate=clustered_mean([np.array([rate]) for rate in rates]),

@@ -70,6 +70,11 @@ class WorldReport:
     moments: Moments
     probed: int
 
+    @property
+    def labels(self) -> NDArray[np.bool_]:
+        """``(slices,)`` which slices are keyframes."""
+        return np.logical_or.reduce(self.keyframes, axis=1)
+
     def save(self, path: Path) -> None:
         """Write everything as one ``.npz`` file without pickled objects."""
         with open(path, "wb") as file:
@@ -115,7 +120,7 @@ class WorldTask:
         far = self.config.lidar.max_depth
         rows = []
         for index, start in enumerate(starts.tolist()):
-            pair = _events_pair if self.events or (probe and index < self.network_pairs) else _depth_pair
+            pair = events_pair if self.events or (probe and index < self.network_pairs) else depth_pair
             found = pair(self.config, scene, start, rng)
             network = np.full((len(GAPS_MS), len(CONTROLS), len(METRIC_NAMES)), np.nan)
             if probe is not None and index < self.network_pairs:
@@ -123,7 +128,7 @@ class WorldTask:
                 for gap, (voxel, truth) in enumerate(zip(found.voxels, found.truths, strict=True)):
                     for c, depth in enumerate(probe.predict(found.prior, voxel, gap, controls)):
                         network[gap, c] = _metrics(depth, truth, far, headless=True)
-            rows.append({**_measure(found, far), "speed": scene.speed(start), "network": network})
+            rows.append({**measure(found, far), "speed": scene.speed(start), "network": network})
         return WorldReport(
             seed=seed,
             description=(scene.scenario, scene.style, scene.weather),
@@ -135,7 +140,7 @@ class WorldTask:
 
 
 @dataclass(frozen=True)
-class _Pair:
+class Pair:
     """A prior, the truths after it, and the voxel grids and shares of pixels with events in between."""
 
     prior: NDArray[np.float32]
@@ -144,17 +149,17 @@ class _Pair:
     active: Sequence[float] = (np.nan,) * len(GAPS_MS)
 
 
-def _depth_pair(config: DrivingConfig, scene: DrivingScene, start: int, rng: np.random.Generator) -> _Pair:
+def depth_pair(config: DrivingConfig, scene: DrivingScene, start: int, rng: np.random.Generator) -> Pair:
     """Depth alone: six frames."""
     intensity, depth = (np.zeros(config.camera.shape, np.float32) for _ in range(2))
     frames = []
     for elapsed in (0, *GAPS_MS):
         scene.render(start + elapsed * 1000, intensity, depth)
         frames.append(quantise(depth, config.lidar.max_depth))
-    return _Pair(frames[0], frames[1:])
+    return Pair(frames[0], frames[1:])
 
 
-def _events_pair(config: DrivingConfig, scene: DrivingScene, start: int, rng: np.random.Generator) -> _Pair:
+def events_pair(config: DrivingConfig, scene: DrivingScene, start: int, rng: np.random.Generator) -> Pair:
     """Depth and events: every tick of the longest gap.
 
     A voxel bin of the longer gaps is a whole number of ticks, so the ticks' event sums add up to it; the
@@ -195,7 +200,7 @@ def _events_pair(config: DrivingConfig, scene: DrivingScene, start: int, rng: np
         if ends_here:
             truths.append(quantise(depth, far))
             active.append(float(touched.mean()))
-    return _Pair(prior, truths, voxels, active)
+    return Pair(prior, truths, voxels, active)
 
 
 def _metrics(
@@ -206,7 +211,7 @@ def _metrics(
     return (*paper_metrics(pred, truth, far), *full_metrics(whole, truth, far))
 
 
-def _measure(pair: _Pair, far: float) -> dict[str, object]:
+def measure(pair: Pair, far: float) -> dict[str, object]:
     """What a :class:`WorldReport` keeps of a pair."""
     prior = pair.prior.astype(np.float64)
     repeat, prior_sky, change = [], [], []

@@ -13,7 +13,6 @@ from scipy.ndimage import distance_transform_edt
 
 from nl_env.scene.render import GroundMap
 from nl_env.scene.textures import GAMMA, noise
-
 from nl_env.scene.traffic import Lane
 
 MARGIN = 190.0
@@ -70,7 +69,9 @@ class Ground:
         rng: source of tones, patches and cracks.
     """
 
-    def __init__(self, lanes: Sequence[Lane], path: NDArray[np.float64], style: str, rng: np.random.Generator) -> None:
+    def __init__(
+        self, lanes: Sequence[Lane], path: NDArray[np.float64], style: str, rng: np.random.Generator
+    ) -> None:
         corner = path.min(0) - MARGIN
         extent = path.max(0) + MARGIN - corner
         texel = max(0.2, math.sqrt(extent[0] * extent[1] / _MAX_TEXELS))
@@ -79,7 +80,9 @@ class Ground:
         image = Image.new("L", size, 0)
         draw = ImageDraw.Draw(image)
         for lane in lanes:
-            draw.line(self._pixels(lane.points), 255, max(1, round((lane.width + 0.8) / texel)), joint="curve")
+            draw.line(
+                self._pixels(lane.points), 255, max(1, round((lane.width + 0.8) / texel)), joint="curve"
+            )
         road = np.asarray(image)
         coarse = max(1, round(_FIELD_TEXEL / texel))
         self.field = RoadField(road[::coarse, ::coarse], corner, coarse * texel)
@@ -87,8 +90,9 @@ class Ground:
         self._canvas = np.empty(road.shape, np.uint8)
         tones = noise(rng, 512, 1.2)
         _compose(
-            road, self.field.distance, 1.0 / coarse, tones, rng.uniform(55, 95), 3.0, 135.0 if town else 95.0,
-            105.0 if style == "downtown" else rng.uniform(60, 110), town, max(2, round(1.6 / texel)), self._canvas,
+            road, self.field.distance, 1.0 / coarse, tones, rng.uniform(55, 95), 3.0,
+            135.0 if town else 95.0, 105.0 if style == "downtown" else rng.uniform(60, 110), town,
+            max(2, round(1.6 / texel)), self._canvas,
         )  # fmt: skip
         self._image = Image.fromarray(self._canvas)
         self._draw = ImageDraw.Draw(self._image)
@@ -107,7 +111,10 @@ class Ground:
         for x, y in self._pixels(at):
             if rng.random() < 0.5:
                 a, b = rng.uniform(0.3, 2.2) / self._texel, rng.uniform(0.3, 1.4) / self._texel
-                column, row = int(min(max(x, 0), self._image.width - 1)), int(min(max(y, 0), self._image.height - 1))
+                column, row = (
+                    int(min(max(x, 0), self._image.width - 1)),
+                    int(min(max(y, 0), self._image.height - 1)),
+                )
                 here = float(self._canvas[row, column])
                 self._draw.ellipse((x - a, y - b, x + a, y + b), int(here * rng.choice([0.72, 1.25])))
             else:
@@ -126,7 +133,9 @@ class Ground:
             travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
             for start in np.arange(0.0, travelled[-1] - 3.0, 9.0):
                 at = np.array([start, start + 3.0])
-                dash = np.stack([np.interp(at, travelled, line[:, 0]), np.interp(at, travelled, line[:, 1])], 1)
+                dash = np.stack(
+                    [np.interp(at, travelled, line[:, 0]), np.interp(at, travelled, line[:, 1])], 1
+                )
                 self._draw.line(self._pixels(dash), _MARKING, 1)
 
     def shadow(self, centres: NDArray[np.float64], radius: float, rng: np.random.Generator) -> None:
@@ -137,8 +146,8 @@ class Ground:
                 row = int(y + rng.normal() * radius / self._texel * 0.45)
                 r = max(1, int(radius / self._texel * rng.uniform(0.1, 0.35)))
                 if r < column < self._image.width - r and r < row < self._image.height - r:
-                    here = self._image.getpixel((column, row))
-                    self._draw.ellipse((column - r, row - r, column + r, row + r), int(0.55 * float(here)))
+                    dark = int(0.55 * self._canvas[row, column])
+                    self._draw.ellipse((column - r, row - r, column + r, row + r), dark)
 
     def finish(self) -> GroundMap:
         """The map for the renderer, gamma-coded."""

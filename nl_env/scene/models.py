@@ -19,24 +19,48 @@ seen from afar get coarser holes, as their leaves merge."""
 
 
 def building(rng: np.random.Generator, style: str) -> Quads:
-    """A block of 1 x 1 m footprint and 1 m height, to be scaled; windows repeat every 3.2 m."""
+    """A house, its front at -y: tall and flat-roofed downtown, low with a gable roof elsewhere."""
     b = QuadBuilder()
     tall = style == "downtown"
     length, depth = rng.uniform(9, 16) if tall else rng.uniform(8, 14), rng.uniform(8, 14)
     height = rng.uniform(8, 34) if tall else rng.uniform(3.5, 9)
     wall = rng.uniform(0.25, 0.8)
-    b.box((0, 0, 0), (length, depth, height), wall, int(rng.choice([tex.WINDOW, tex.WINDOW, tex.WINDOW, tex.BRICK])), 3.2, 0.6 * wall)
+    b.box(
+        (0, 0, 0),
+        (length, depth, height),
+        wall,
+        int(rng.choice([tex.WINDOW, tex.WINDOW, tex.WINDOW, tex.BRICK])),
+        3.2,
+        0.6 * wall,
+    )
     for _ in range(int(rng.integers(0, 3))):
         along, up = rng.uniform(-length / 2, length / 2), rng.uniform(2.2, max(2.5, height - 1))
-        b.box((along, -depth / 2 - 0.5, up), (rng.uniform(1, 3), 1.0, rng.uniform(0.1, 1.0)), rng.uniform(0.2, 0.9), tex.PLANK, 1)
+        b.box(
+            (along, -depth / 2 - 0.5, up),
+            (rng.uniform(1, 3), 1.0, rng.uniform(0.1, 1.0)),
+            rng.uniform(0.2, 0.9),
+            tex.PLANK,
+            1,
+        )
     if tall:
         for _ in range(int(rng.integers(0, 3))):
             x, y = rng.uniform(-length / 2, length / 2), rng.uniform(-depth / 2, depth / 2)
-            b.box((x, y, height), (rng.uniform(0.3, 2), rng.uniform(0.3, 2), rng.uniform(0.5, 3)), rng.uniform(0.2, 0.8))
+            b.box(
+                (x, y, height),
+                (rng.uniform(0.3, 2), rng.uniform(0.3, 2), rng.uniform(0.5, 3)),
+                rng.uniform(0.2, 0.8),
+            )
     else:
         for side in (-1, 1):
             eave = (-length / 2 - 0.4, side * (depth / 2 + 0.5), height)
-            b.quad(eave, (length + 0.8, 0, 0), (0, -side * (depth / 2 + 0.5), 2.2), 0.5 * wall + 0.1, tex.PLANK, (6, 3))
+            b.quad(
+                eave,
+                (length + 0.8, 0, 0),
+                (0, -side * (depth / 2 + 0.5), 2.2),
+                0.5 * wall + 0.1,
+                tex.PLANK,
+                (6, 3),
+            )
     return b.build()
 
 
@@ -56,10 +80,22 @@ def tree(rng: np.random.Generator, cards: int, leaf_tile: float, conifer: bool =
         if conifer:
             level, angle = rng.uniform(0, 1), rng.uniform(0, 2 * math.pi)
             reach = 0.7 * radius * (1 - level) * spread
-            centre = np.array([reach * math.cos(angle), reach * math.sin(angle), 0.5 * clear + level * (height - 0.5 * clear)])
+            centre = np.array(
+                [
+                    reach * math.cos(angle),
+                    reach * math.sin(angle),
+                    0.5 * clear + level * (height - 0.5 * clear),
+                ]
+            )
         else:
             d = rng.normal(size=3)
-            centre = d / np.linalg.norm(d) * math.sqrt(rng.uniform(0.25, 1)) * spread * np.array([radius, radius, half])
+            centre = (
+                d
+                / np.linalg.norm(d)
+                * math.sqrt(rng.uniform(0.25, 1))
+                * spread
+                * np.array([radius, radius, half])
+            )
             centre[2] += (clear + height) / 2
         a = rng.normal(size=3)
         a /= np.linalg.norm(a)
@@ -165,7 +201,14 @@ def car(rng: np.random.Generator, length: float, width: float, height: float) ->
     grey = float(rng.choice([0.08, 0.15, 0.3, 0.45, 0.6, 0.75, 0.9]))
     waist = 0.57 * height
     b.box((0, 0, 0.3), (length, width, waist - 0.3), grey)
-    b.box((-0.03 * length, 0, waist), (0.55 * length, 0.88 * width, height - waist), 0.9 * grey + 0.02, tex.CAR, 2.6, grey)
+    b.box(
+        (-0.03 * length, 0, waist),
+        (0.55 * length, 0.88 * width, height - waist),
+        0.9 * grey + 0.02,
+        tex.CAR,
+        2.6,
+        grey,
+    )
     front, rear = length / 2 + 0.01, -length / 2 - 0.01
     for y in (-width / 2 + 0.1, width / 2 - 0.45):
         b.quad((front, y, 0.6), (0, 0.35, 0), (0, 0, 0.16), 0.95, two_sided=False, normal=(1, 0, 0))
@@ -183,9 +226,13 @@ def truck(rng: np.random.Generator, length: float, width: float, height: float) 
     b = QuadBuilder()
     grey = rng.uniform(0.2, 0.9)
     b.box((-0.9, 0, 0.6), (length - 1.8, width, height - 0.6), grey, tex.PLANK, 4)
-    b.box((length / 2 - 0.9, 0, 0.5), (1.8, width, 0.6 * height), float(rng.choice([0.2, 0.6, 0.8])), tex.CAR, 3)
+    b.box(
+        (length / 2 - 0.9, 0, 0.5), (1.8, width, 0.6 * height), float(rng.choice([0.2, 0.6, 0.8])), tex.CAR, 3
+    )
     b.box((0, 0, 0.3), (length, 0.8 * width, 0.35), 0.1)
-    b.quad((-length / 2 - 0.01, -0.25, 0.65), (0, 0.5, 0), (0, 0, 0.13), 0.85, two_sided=False, normal=(-1, 0, 0))
+    b.quad(
+        (-length / 2 - 0.01, -0.25, 0.65), (0, 0.5, 0), (0, 0, 0.13), 0.85, two_sided=False, normal=(-1, 0, 0)
+    )
     return b.build()
 
 

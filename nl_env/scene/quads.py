@@ -43,7 +43,7 @@ class Quads(NamedTuple):
     two_sided: Int
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         """Number of parallelograms."""
         return self.albedo.shape[0]
 
@@ -91,7 +91,9 @@ def join(parts: list[Quads]) -> Quads:
     """Concatenate quads in order."""
     if not parts:
         return empty_quads()
-    return Quads(*(np.ascontiguousarray(np.concatenate(field, axis=-1)) for field in zip(*parts, strict=True)))
+    return Quads(
+        *(np.ascontiguousarray(np.concatenate(field, axis=-1)) for field in zip(*parts, strict=True))
+    )
 
 
 class QuadBuilder:
@@ -132,7 +134,7 @@ class QuadBuilder:
     ) -> None:
         """Add an axis-aligned box turned by ``yaw``: four sides and a top, seen from outside only.
 
-        ``base`` is the centre of the bottom face, ``size`` the full extents, ``tile`` metres per texture repeat.
+        ``base`` is the centre of the bottom face, ``size`` the full extents, ``tile`` metres per repeat.
         """
         ex = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         ey = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
@@ -146,9 +148,7 @@ class QuadBuilder:
             self.quad(
                 start, along, ez * z, albedo, texture, (times, repeat_z), two_sided=False, normal=normal
             )
-        self.quad(
-            corner + ez * z, ex * x, ey * y, albedo if top is None else top, two_sided=False, normal=ez
-        )
+        self.quad(corner + ez * z, ex * x, ey * y, albedo if top is None else top, two_sided=False, normal=ez)
 
     def build(self) -> Quads:
         """The collected parallelograms."""
@@ -177,37 +177,39 @@ def place(
         template: quads in their own frame.
         position: ``(M, 3)`` metres.
         yaw: ``(M,)`` radians about z.
-        scale: ``(M,)`` or scalar, uniform, or ``(M, 3)`` along the template's own axes.
+        scale: ``(M,)`` or scalar.
         brightness: ``(M,)`` or scalar factor on the albedo.
     """
-    copies, n = len(position), template.count
+    copies, n = len(position), template.number
     cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    size = np.broadcast_to(np.asarray(scale, np.float64).reshape(-1, 1 if np.ndim(scale) < 2 else 3), (copies, 3))
+    size = np.broadcast_to(np.asarray(scale, np.float64).reshape(-1, 1), (copies, 1))
+    light = np.broadcast_to(np.asarray(brightness, np.float64).reshape(-1, 1), (copies, 1))
 
-    def turn(vectors: Float, factors: NDArray[np.float64]) -> Float:
-        x, y, z = (vectors[i][None, :] * factors[:, i, None] for i in range(3))
-        return np.stack([cos * x - sin * y, sin * x + cos * y, z + 0 * x]).astype(np.float32)
+    def turn(vectors: Float, factor: NDArray[np.float64]) -> Float:
+        x, y, z = (vectors[i][None] * factor for i in range(3))
+        return np.stack([cos * x - sin * y, sin * x + cos * y, z]).astype(np.float32)
 
     origin = turn(template.origin, size) + position.T[:, :, None].astype(np.float32)
     u, v = turn(template.u, size), turn(template.v, size)
-    normal = turn(template.normal, 1.0 / size)
-    normal /= np.linalg.norm(normal, axis=0) + 1e-12
+    normal = turn(template.normal, np.ones((copies, 1)))
     corners = np.stack([origin, origin + u, origin + v, origin + u + v])
     low, high = corners.min((0, 3)), corners.max((0, 3))
     centre = (low + high) / 2
     radius = np.sqrt(((corners - centre[None, :, :, None]) ** 2).sum(1).max((0, 2)))
-    tile = lambda a: np.tile(a, copies)  # noqa: E731
+    origin, u, v, normal = (np.ascontiguousarray(a.reshape(3, -1)) for a in (origin, u, v, normal))
+    repeat = np.tile(template.repeat, copies)
     quads = Quads(
-        *(np.ascontiguousarray(a.reshape(3, copies * n)) for a in (origin, u, v, normal)),
-        (template.albedo[None] * np.broadcast_to(np.asarray(brightness, np.float32).reshape(-1, 1), (copies, 1)))
-        .ravel()
-        .astype(np.float32),
-        tile(template.texture),
-        tile(template.repeat),
-        tile(template.shift),
-        texture_density(u.reshape(3, -1), v.reshape(3, -1), tile(template.repeat)),
-        tile(template.cutout),
-        tile(template.two_sided),
+        origin,
+        u,
+        v,
+        normal,
+        albedo=(template.albedo[None] * light).ravel().astype(np.float32),
+        texture=np.tile(template.texture, copies),
+        repeat=repeat,
+        shift=np.tile(template.shift, copies),
+        density=texture_density(u, v, repeat),
+        cutout=np.tile(template.cutout, copies),
+        two_sided=np.tile(template.two_sided, copies),
     )
     objects = Objects(
         centre.astype(np.float32),
@@ -220,7 +222,7 @@ def place(
 
 def assemble(parts: list[tuple[Quads, Objects]]) -> tuple[Quads, Objects]:
     """Join placed templates into one world."""
-    starts = np.cumsum([0, *(q.count for q, _ in parts)])
+    starts = np.cumsum([0, *(q.number for q, _ in parts)])
     objects = [o._replace(first=o.first + np.int32(s)) for (_, o), s in zip(parts, starts, strict=False)]
     joined = Objects(*(np.ascontiguousarray(np.concatenate(f, axis=-1)) for f in zip(*objects, strict=True)))
     return join([q for q, _ in parts]), joined

@@ -16,7 +16,9 @@ _REFERENCE_WIDTH = 640
 def _hash(a, b):
     """A uniform number in [0, 1) from two integers."""
     # Numba widens products of uint32 to uint64: cut back after each step.
-    h = np.uint32(np.uint32(np.uint32(a) * np.uint32(0x9E3779B1)) ^ np.uint32(np.uint32(b) * np.uint32(0x85EBCA77)))
+    h = np.uint32(
+        np.uint32(np.uint32(a) * np.uint32(0x9E3779B1)) ^ np.uint32(np.uint32(b) * np.uint32(0x85EBCA77))
+    )
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x2C1B3C6D))
     h = np.uint32((h ^ (h >> np.uint32(12))) * np.uint32(0x297A2D39))
     return np.uint32((h ^ (h >> np.uint32(15))) >> np.uint32(8)) * (1.0 / 16777216.0)

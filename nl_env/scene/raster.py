@@ -11,6 +11,7 @@ signed indices a wrap-around test, in loops that run millions of times a second.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -27,8 +28,8 @@ GROUND, SKY_ID, CUTOUT = i4(0), i4(-1), i4(-2)
 ``CUTOUT - (r << 8 | texel)``."""
 NEAR = 0.15
 """Nearest visible depth, m."""
-FAST = {"fastmath": True, "error_model": "numpy", "cache": True, "boundscheck": False}
-INLINE = {**FAST, "forceinline": True}
+FAST: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "cache": True, "boundscheck": False}
+INLINE: dict[str, Any] = {**FAST, "forceinline": True}
 
 # Columns of a packed quad (see quads.Quads.packed).
 ORIGIN, U, V, NORMAL = 0, 3, 6, 9
@@ -200,9 +201,12 @@ def _fill_opaque(table, r, first, last, inverse_depth, index):
     step = f4(table[r, WX])
     for row in range(first, last + 1):
         low, high = _span(table, r, float(row))
+        # Compared before they become integers: the ends of an empty span can be astronomically far.
+        if high < low - 1e-3:
+            continue
         # Neighbouring faces share edges: a hair of overlap leaves no crack between them.
-        x0 = int(math.ceil(low - 1e-4))
-        n = int(math.floor(high + 1e-4)) + 1 - x0
+        x0 = math.ceil(low - 1e-4)
+        n = math.floor(high + 1e-4) + 1 - x0
         if n <= 0:
             continue
         start = f4(table[r, W0] + table[r, WY] * row + table[r, WX] * x0)
@@ -227,8 +231,10 @@ def _fill_cutout(table, r, first, last, cutouts, inverse_depth, index, texel_at,
     base = i4(CUTOUT - (i4(r) << i4(8)))
     for row in range(first, last + 1):
         low, high = _span(table, r, float(row))
-        x0 = int(math.ceil(low))
-        n = int(math.floor(high)) + 1 - x0
+        if high < low:
+            continue
+        x0 = math.ceil(low)
+        n = math.floor(high) + 1 - x0
         if n <= 0:
             continue
         start = f4(table[r, W0] + table[r, WY] * row + table[r, WX] * x0)

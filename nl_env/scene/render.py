@@ -1,7 +1,8 @@
 """Software renderer: pixel-aligned intensity and z-depth of parallelograms over a painted ground plane.
 
-One frame is: cull objects, project their quads (``raster``), rasterise, shade (``shading``), blur. Grey levels are gamma-coded throughout (products of powers are powers of
-products), so no power is taken per pixel.
+One frame is: cull objects, project their quads and rasterise (``raster``), shade and blur (``shading``).
+Grey levels are gamma-coded throughout (products of powers are powers of products), so no power is taken
+per pixel.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class Buffers(NamedTuple):
     """Working memory of one renderer: frame buffers, the draw list, and one row of shading scratch."""
 
     inverse_depth: NDArray[np.float32]
-    index: NDArray[np.int32]
+    indices: NDArray[np.int32]
     shade: NDArray[np.float32]
     table: NDArray[np.float64]
     visible: NDArray[np.int32]
@@ -117,7 +118,7 @@ def render_frame(
     intensity, depth, with_depth,
 ):  # fmt: skip
     """Render one frame into ``intensity`` and, when asked for, ``depth``."""
-    inverse_depth, index, shade, table = buffers.inverse_depth, buffers.index, buffers.shade, buffers.table
+    inverse_depth, index, shade, table = buffers.inverse_depth, buffers.indices, buffers.shade, buffers.table
     visible, at, texel = buffers.visible, buffers.at, buffers.texel
     fa, fb, gain, bias = buffers.fa, buffers.fb, buffers.gain, buffers.bias
     fx, fy, cx, cy = lens
@@ -132,7 +133,19 @@ def render_frame(
             objects.centre, objects.radius, rotation, eye, lens, width, height, SEEN, visible
         )
         used = raster.list_quads(
-            quads, visible, count, objects.first, objects.size, rotation, eye, lens, width, height, SEEN, table, used
+            quads,
+            visible,
+            count,
+            objects.first,
+            objects.size,
+            rotation,
+            eye,
+            lens,
+            width,
+            height,
+            SEEN,
+            table,
+            used,
         )
     # Bands keep the depth and index buffers in the cache while many surfaces are drawn over each other.
     band = max(8, BAND_PIXELS // width)
@@ -142,7 +155,8 @@ def render_frame(
         raster.rasterise(first, last, used, table, textures.cutouts, inverse_depth, index, at, texel)
         shading.shade_rows(
             first, last, rotation, eye, lens, table, textures.packed, textures.offsets, ground.packed,
-            ground.layout, ground.corner, ground.texel, light, inverse_depth, index, at, fa, fb, gain, bias, shade,
+            ground.layout, ground.corner, ground.texel, light, inverse_depth, index, at, fa, fb, gain, bias,
+            shade,
         )  # fmt: skip
     shading.blur(shade, BLUR_SIDE, bias, intensity)
     if with_depth:
@@ -176,7 +190,9 @@ class Renderer:
         self._light = light
         self._textures: Textures = load()
         self._lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        self._buffers = Buffers.allocate(camera, quads.count + moving_quads, max(self._objects.radius.size, moving_objects))
+        self._buffers = Buffers.allocate(
+            camera, quads.number + moving_quads, max(self._objects.radius.size, moving_objects)
+        )
         self._no_depth = np.zeros((1, 1), np.float32)
 
     def render(
@@ -188,7 +204,8 @@ class Renderer:
     ) -> None:
         """Render from ``pose`` (4x4 camera to world) into ``(H, W)`` float32 ``intensity`` and ``depth``.
 
-        ``moving`` are packed quads (see :meth:`Quads.packed`) and their objects. Intensity is gamma-coded grey in [0.001, 1]; depth is z-depth in metres, 0 beyond ``FAR``.
+        ``moving`` are packed quads (see :meth:`Quads.packed`) and their objects. Intensity is gamma-coded
+        grey in [0.001, 1]; depth is z-depth in metres, 0 beyond ``FAR``.
         """
         render_frame(
             self._static,

@@ -76,7 +76,7 @@ class DrivingScene:
         parts = [_actor_model(actor, rng) for actor in self.traffic.actors]
         self._template = world.light(join(parts), conditions, azimuth).packed()
         self._moving = self._template.copy()
-        sizes = np.array([p.count for p in parts], np.int32)
+        sizes = np.array([p.number for p in parts], np.int32)
         count = len(parts)
         self._actors = Objects(
             np.zeros((3, count), np.float32),
@@ -92,7 +92,9 @@ class DrivingScene:
         self._phases = rng.uniform(0, 2 * np.pi, 6)
         self.noise_scale = conditions.noise_scale
 
-    def render(self, t_us: int, intensity: NDArray[np.float32], depth: NDArray[np.float32] | None = None) -> None:
+    def render(
+        self, t_us: int, intensity: NDArray[np.float32], depth: NDArray[np.float32] | None = None
+    ) -> None:
         """Render the instant ``t_us``.
 
         Args:
@@ -118,7 +120,7 @@ class DrivingScene:
         pitch -= 0.25 * self._config.vibration * min(max(ego.acceleration, -4.0), 4.0)
         roll = shake * (0.15 * wave(0.9, 3) + 0.06 * wave(4.3, 4))
         return camera_pose(
-            np.array([ego.x, ego.y, self._config.camera_height + 0.015 * shake * wave(1.4, 5)]),
+            (ego.x, ego.y, self._config.camera_height + 0.015 * shake * wave(1.4, 5)),
             ego.heading,
             math.radians(pitch),
             math.radians(roll),
@@ -131,9 +133,9 @@ class DrivingScene:
         rotation = self.pose(t_us)[:3, :3]
         spin = before[:3, :3].T @ after[:3, :3] / dt
         linear = rotation.T @ (after[:3, 3] - before[:3, 3]) / dt
-        return np.array([*linear, spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]]) * (
-            1, 1, 1, 0.5, 0.5, 0.5
-        )  # fmt: skip
+        # The antisymmetric part of R' dR/dt holds the angular velocity.
+        turn = 0.5 * (spin - spin.T)
+        return np.array([*linear, turn[2, 1], turn[0, 2], turn[1, 0]])
 
     def speed(self, t_us: int) -> float:
         """Ego speed, m/s."""
@@ -154,16 +156,20 @@ class DrivingScene:
         return {"scenario": self.scenario, "style": self.style, "weather": self.weather, "seed": self.seed}
 
 
-def camera_pose(position: NDArray[np.float64], heading: float, pitch: float, roll: float) -> NDArray[np.float64]:
+def camera_pose(
+    position: tuple[float, float, float], heading: float, pitch: float, roll: float
+) -> NDArray[np.float64]:
     """Camera-to-world pose of a forward-looking camera; positive pitch looks down, angles in radians."""
-    forward = np.array(
-        [math.cos(heading) * math.cos(pitch), math.sin(heading) * math.cos(pitch), -math.sin(pitch)]
+    ch, sh, cp, sp = math.cos(heading), math.sin(heading), math.cos(pitch), math.sin(pitch)
+    cr, sr = math.cos(roll), math.sin(roll)
+    right = (sh, -ch, 0.0)
+    down = (-ch * sp, -sh * sp, -cp)
+    x, y, z = position
+    return np.array(
+        [
+            [cr * right[0] + sr * down[0], cr * down[0] - sr * right[0], ch * cp, x],
+            [cr * right[1] + sr * down[1], cr * down[1] - sr * right[1], sh * cp, y],
+            [sr * down[2], cr * down[2], -sp, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
     )
-    right = np.array([math.sin(heading), -math.cos(heading), 0.0])
-    down = np.cross(forward, right)
-    pose = np.eye(4)
-    pose[:3, 0] = math.cos(roll) * right + math.sin(roll) * down
-    pose[:3, 1] = -math.sin(roll) * right + math.cos(roll) * down
-    pose[:3, 2] = forward
-    pose[:3, 3] = position
-    return pose

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 from nl_env.scene import raster as r
@@ -127,7 +126,11 @@ def _ground_run(y, x0, x1, rays, eye, footprint, ground_map, layout, corner, tex
     side = SIZE >> level
     bits, mask, offset = i4(8 - level), i4(side - 1), i4(offsets[DETAIL, level])
     px, py = eye[0] / DETAIL_METRES, eye[1] / DETAIL_METRES
-    scale, mx, my = f4(side / DETAIL_METRES), f4((px - math.floor(px)) * side), f4((py - math.floor(py)) * side)
+    scale, mx, my = (
+        f4(side / DETAIL_METRES),
+        f4((px - math.floor(px)) * side),
+        f4((py - math.floor(py)) * side),
+    )
     film_share, film_grey = f4(gloss), f4(sky)
     for i in range(n):
         x = left + u8(i)
@@ -199,8 +202,8 @@ def _finish_row(y, packed, fog, haze, inverse_depth, at, fa, fb, gain, bias, sha
 
 
 @njit(**FAST)
-def shade_rows(first, last, rotation, eye, lens, table, packed, offsets, ground_map, layout, corner, texel, light,
-               inverse_depth, index, at, fa, fb, gain, bias, shade):  # fmt: skip
+def shade_rows(first, last, rotation, eye, lens, table, packed, offsets, ground_map, layout, corner, texel,
+               light, inverse_depth, index, at, fa, fb, gain, bias, shade):  # fmt: skip
     """Shade image rows ``first`` to ``last - 1``."""
     fx, fy, cx, cy = lens
     width = index.shape[1]
@@ -259,9 +262,9 @@ def blur(shade, side, row, intensity):
         for x in range(width):
             row[x] = min(centre * shade[here, x] + weight * (shade[above, x] + shade[below, x]), ONE)
         for i in range(width - 2):
-            x = u8(i) + u8(1)
-            near = row[u8(i)] + row[x + u8(1)]
-            intensity[here, x] = max(centre * row[x] + weight * near, FLOOR)
+            middle = u8(i) + u8(1)
+            beside = row[u8(i)] + row[middle + u8(1)]
+            intensity[here, middle] = max(centre * row[middle] + weight * beside, FLOOR)
         last = u8(width - 1)
         intensity[here, u8(0)] = max((centre + weight) * row[u8(0)] + weight * row[u8(1)], FLOOR)
         intensity[here, last] = max((centre + weight) * row[last] + weight * row[last - u8(1)], FLOOR)

@@ -64,7 +64,9 @@ def noise(rng: np.random.Generator, size: int, slope: float) -> NDArray[np.float
     return ((image - image.mean()) / image.std()).astype(np.float32)
 
 
-def _grain(rng: np.random.Generator, contrast: float, slope: float, low: float, high: float) -> NDArray[np.float32]:
+def _grain(
+    rng: np.random.Generator, contrast: float, slope: float, low: float, high: float
+) -> NDArray[np.float32]:
     return np.clip(1 + contrast * noise(rng, SIZE, slope), low, high)
 
 
@@ -113,7 +115,10 @@ def _twigs(rng: np.random.Generator) -> NDArray[np.bool_]:
                 point = point + 0.5 * np.array([np.cos(direction), np.sin(direction)])
                 x, y = int(point[0]), int(point[1])
                 if 0 <= x < SIZE and 0 <= y < SIZE:
-                    mask[max(0, y - width // 2) : y + width // 2 + 1, max(0, x - width // 2) : x + width // 2 + 1] = True
+                    mask[
+                        max(0, y - width // 2) : y + width // 2 + 1,
+                        max(0, x - width // 2) : x + width // 2 + 1,
+                    ] = True
             direction += rng.normal() * 0.5
     return mask
 

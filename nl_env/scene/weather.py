@@ -57,9 +57,11 @@ class Weather:
         )
 
     def shade(self, normals: NDArray[np.floating], azimuth: float) -> NDArray[np.float64]:
-        """Linear brightness of surfaces with the ``(3, N)`` unit ``normals``, sun at ``azimuth`` (radians)."""
+        """Linear brightness of surfaces with ``(3, N)`` unit ``normals``; sun at ``azimuth`` (radians)."""
         horizontal = math.cos(self.sun_elevation)
-        sun = np.array([horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(self.sun_elevation)])
+        sun = np.array(
+            [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(self.sun_elevation)]
+        )
         direct = np.clip(sun @ normals, 0.0, None)
         return np.asarray(self.exposure * (self.ambient + (1 - self.ambient) * 1.3 * direct), np.float64)
 
@@ -79,7 +81,19 @@ _SKIES = {
 def preset(name: str) -> Weather:
     """The preset ``name``, one of ``config.WEATHERS``."""
     sunset = name.endswith("Sunset")
-    ambient, exposure, sky, clouds, fog, wetness, streaks, noise = _SKIES[name.removesuffix("Sunset").removesuffix("Noon")]
+    ambient, exposure, sky, clouds, fog, wetness, streaks, noise = _SKIES[
+        name.removesuffix("Sunset").removesuffix("Noon")
+    ]
     if sunset:
-        return Weather(math.radians(12), 0.8 * ambient, 0.62 * exposure, 0.72 * sky, clouds, fog, wetness, streaks, 1.5 * noise)
+        return Weather(
+            math.radians(12),
+            0.8 * ambient,
+            0.62 * exposure,
+            0.72 * sky,
+            clouds,
+            fog,
+            wetness,
+            streaks,
+            1.5 * noise,
+        )
     return Weather(math.radians(58), ambient, exposure, sky, clouds, fog, wetness, streaks, noise)

@@ -51,10 +51,18 @@ class Style:
 
 
 STYLES: dict[str, Style] = {
-    "downtown": Style(15, (11, 17.5), 1.0, 310, 155.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True),
-    "suburb": Style(19, (20, 45), 0.75, 250, 135.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True),
-    "park": Style(19, (20, 45), 0.3, 250, 135.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True),
-    "rural": Style(19, (14, 40), 0.2, 205, 108.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False),
+    "downtown": Style(
+        15, (11, 17.5), 1.0, 310, 155.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True
+    ),
+    "suburb": Style(
+        19, (20, 45), 0.75, 250, 135.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
+    ),
+    "park": Style(
+        19, (20, 45), 0.3, 250, 135.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
+    ),
+    "rural": Style(
+        19, (14, 40), 0.2, 205, 108.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False
+    ),
 }
 _HIGHWAYS = ("highway", "merge", "exit")
 _TREE_LEVELS = (
@@ -108,7 +116,9 @@ class _Builder:
             if not count:
                 continue
             for side in (1, -1):
-                s = (np.arange(count) + self.rng.uniform(-jitter, jitter, count) + self.rng.uniform()) * spacing
+                s = (
+                    np.arange(count) + self.rng.uniform(-jitter, jitter, count) + self.rng.uniform()
+                ) * spacing
                 keep = (self.rng.random(count) < share) & (s > 0) & (s < length[-1])
                 s = s[keep]
                 heading = np.interp(s, length, np.unwrap(lane.headings))
@@ -157,7 +167,7 @@ class _Builder:
         return [make(self.rng) for _ in range(count)]
 
     def trees(self, points: NDArray[np.float64], scale: tuple[float, float]) -> None:
-        """Trees with as many leaf planes as their nearest sight deserves; no level ever changes during a drive."""
+        """Trees with as many leaf planes as their nearest sight deserves; no level changes during a drive."""
         seen = self.focal * 2.6 / np.maximum(self.path_distance(points), 4.0) if len(points) else np.zeros(0)
         for low, high, cards, tile in _TREE_LEVELS:
             at = points[(seen >= low) & (seen < high)]
@@ -167,12 +177,17 @@ class _Builder:
                     kinds.append(models.bare_tree(self.rng))
                 self.add(kinds, at, self.rng.uniform(0, 2 * np.pi, len(at)), scale, (0.25, 0.5))
 
-    def houses(self, templates: Sequence[Quads], points: NDArray[np.float64], yaws: NDArray[np.float64]) -> None:
+    def houses(
+        self, templates: Sequence[Quads], points: NDArray[np.float64], yaws: NDArray[np.float64]
+    ) -> None:
         """Buildings whose whole footprint is off the road."""
         if not len(points):
             return
         half = 8.0
-        corners = [points + half * np.stack([np.cos(yaws + a), np.sin(yaws + a)], 1) for a in np.arange(8) * np.pi / 4]
+        corners = [
+            points + half * np.stack([np.cos(yaws + a), np.sin(yaws + a)], 1)
+            for a in np.arange(8) * np.pi / 4
+        ]
         clear = np.min([self.ground.field(c) for c in corners], axis=0) >= 1.5
         self.add(templates, points[clear], yaws[clear])
 
@@ -190,7 +205,9 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
     s = STYLES[style]
     b = _Builder(traffic, style, focal, rng)
     houses = b.variants(lambda r: models.building(r, style), 8)
-    points, yaws = b.along(s.building_spacing, (s.building_setback[0] + 5, s.building_setback[1] + 5), s.building_share, 0.15)
+    points, yaws = b.along(
+        s.building_spacing, (s.building_setback[0] + 5, s.building_setback[1] + 5), s.building_share, 0.15
+    )
     b.houses(houses, points, yaws)
 
     centre = b.path[rng.integers(len(b.path), size=s.belt)]
@@ -226,6 +243,6 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
 
 
 def light(quads: Quads, weather: Weather, azimuth: float) -> Quads:
-    """Quads with linear albedo turned into gamma-coded grey under the sun; leaves scatter and have no side."""
+    """Quads with linear albedo turned into gamma-coded grey under the sun; leaves have no bright side."""
     shade = np.where(quads.cutout == 1, weather.exposure, weather.shade(quads.normal, azimuth))
     return quads._replace(albedo=(np.clip(quads.albedo * shade, 0.004, 1) ** GAMMA).astype(np.float32))
