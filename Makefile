@@ -7,7 +7,7 @@
 PYTHON ?= python3
 WORKERS ?= 2
 BIN := .venv/bin
-COMPILING = find nl_env -name '*.nbi' | grep -q . || echo "compiling kernels, once (a minute or two)" >&2
+COMPILING = find nl_env -name '*.nbi' | grep -q . || echo "compiling kernels, once (about a minute)" >&2
 
 .PHONY: compare test lint bench realism clean
 .DELETE_ON_ERROR:

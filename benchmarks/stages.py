@@ -1,7 +1,7 @@
 """Time of every stage of the synthetic environment, on one thread, at three resolutions. Asserts nothing.
 
 One test world per scenario; style and weather follow from its seed. Prints JSON; ``--markdown`` writes
-the page ``docs/performance.md``. Usage: ``python benchmarks/stages.py [--worlds 7] [--slices 50]``.
+the page ``docs/performance.md``. Usage: ``python benchmarks/stages.py [--worlds 7] [--slices 30]``.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def markdown(report: dict[str, Any], command: str) -> str:
         "",
         f"Written by `{command}`; the same numbers as JSON are in `performance.json`. Machine: {m['cpu']},",
         f"{m['cores']} cores; Python {m['python']}, NumPy {m['numpy']}, Numba {m['numba']}. One thread.",
-        f"Worlds: the first {len(report['worlds'])} test seeds, one a scenario ({scenarios}), as shipped,",
+        f"Worlds: the first {len(report['worlds'])} test seeds, one a scenario ({scenarios}),",
         f"{report['slices']} slices of 20 ms each. Kernels were compiled before.",
         "",
         "## Stages",
@@ -283,7 +283,7 @@ def main() -> None:
     parser.add_argument(
         "--worlds", type=int, default=len(SCENARIOS), help="number of worlds, 1 to 7 (default 7)"
     )
-    parser.add_argument("--slices", type=int, default=50, help="slices of each world (default 50)")
+    parser.add_argument("--slices", type=int, default=30, help="slices of each world (default 30)")
     parser.add_argument("--json", type=Path, help="also write the JSON to this file")
     parser.add_argument("--markdown", type=Path, help="also write the page to this file")
     args = parser.parse_args()

@@ -63,7 +63,7 @@ class SceneConfig:
     style: str | None = None
     weather: str | None = None
     duration_s: float = 20.0
-    fov_deg: float = 76.0
+    fov_deg: float = 75.0
     camera_height: float = 2.4
     vibration: float = 0.3
 

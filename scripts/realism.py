@@ -131,30 +131,36 @@ def results(settings: Settings, summary: Summary, reports: Sequence[WorldReport]
     )
 
 
-def update_document(path: Path, settings: Settings, summary: Summary) -> None:
-    """Replace what is between the result marks of ``path``.
+def around_results(document: Path) -> tuple[str, str]:
+    """What is before and after the results of ``document``.
 
     Raises:
         ValueError: the marks are missing.
     """
-    text = path.read_text(encoding="utf-8")
+    text = document.read_text(encoding="utf-8")
     if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"markdown: found no {BEGIN} ... {END} in {path}, expected each once")
-    head, tail = text.split(BEGIN)[0], text.split(END)[1]
-    images = path.parent / "images"
+        raise ValueError(f"markdown: found no {BEGIN} ... {END} in {document}, expected each once")
+    return text.split(BEGIN)[0], text.split(END)[1]
+
+
+def update_document(document: Path, settings: Settings, summary: Summary) -> None:
+    """Replace the results of ``document``, and its plots in ``images/`` beside it."""
+    head, tail = around_results(document)
+    images = document.parent / "images"
     images.mkdir(exist_ok=True)
     save_plots(summary, images)
-    plots = "\n\n".join(
-        f"![{name}](images/{name})" for name in (DEPTH_PLOT, EVENT_PLOT) if (images / name).exists()
-    )
-    shown = ", ".join(f"{k} {v}" for k, v in asdict(settings).items() if k != "checkpoint")
-    write_text(path, f"{head}{BEGIN}\n\n{shown}\n\n{markdown(summary)}\n{plots}\n\n{END}{tail}")
+    plots = "\n\n".join(f"![{name}](images/{name})" for name in (DEPTH_PLOT, EVENT_PLOT))
+    shown = ", ".join(f"{name} {value}" for name, value in asdict(settings).items() if name != "checkpoint")
+    text = f"Settings: {shown}.\n\n{markdown(summary)}\n{plots}"
+    write_text(document, f"{head}{BEGIN}\n\n{text}\n\n{END}{tail}")
 
 
 def run(options: Options) -> Summary:
     """Measure, write the output folder, print the tables."""
     settings = options.settings
     settings.validate()
+    if options.markdown is not None:
+        around_results(options.markdown)  # fails before the work
     folder = open_folder(options.out, asdict(settings), overwrite=options.overwrite, resume=options.resume)
     with tqdm(total=settings.worlds, desc="worlds", unit="world", disable=None) as bar:
         reports = run_sequences(

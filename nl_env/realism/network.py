@@ -36,6 +36,8 @@ class ReleasedProbe:
 
         from nl_env.depth.unet import batch_norms, load_released
 
+        # One thread, so that results do not depend on how worlds are spread over processes.
+        torch.set_num_threads(1)
         self._network = load_released(checkpoint)
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         layers = [layer for _, layer in batch_norms(self._network)]

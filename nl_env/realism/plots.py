@@ -17,13 +17,11 @@ DEPTH_PLOT, EVENT_PLOT = "depth_change.png", "event_change.png"
 
 
 def save_plots(summary: Summary, folder: Path) -> None:
-    """Write ``DEPTH_PLOT`` and, when events were simulated, ``EVENT_PLOT`` into ``folder``."""
+    """Write ``DEPTH_PLOT`` and ``EVENT_PLOT`` into ``folder``; the latter is empty without events."""
     rows = [row for row in summary.speeds if row.pairs]
     labels = [f"{speed_label(row)} km/h" for row in rows]
     _save(folder / DEPTH_PLOT, labels, [row.depth_change for row in rows], "mean |depth change| (m)", 1.0)
-    active = [row.active for row in rows]
-    if any(mean.value >= 0 for band in active for mean in band):
-        _save(folder / EVENT_PLOT, labels, active, "active event pixels (%)", 100.0)
+    _save(folder / EVENT_PLOT, labels, [row.active for row in rows], "active event pixels (%)", 100.0)
 
 
 def _save(

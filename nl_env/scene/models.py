@@ -23,7 +23,7 @@ def building(rng: np.random.Generator, style: str) -> Quads:
     b = QuadBuilder()
     tall = style == "downtown"
     length, depth = rng.uniform(9, 16) if tall else rng.uniform(8, 14), rng.uniform(8, 14)
-    height = rng.uniform(8, 34) if tall else rng.uniform(3.5, 9)
+    height = rng.uniform(12, 45) if tall else rng.uniform(4, 12)
     wall = rng.uniform(0.25, 0.8)
     b.box(
         (0, 0, 0),

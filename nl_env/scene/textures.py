@@ -22,7 +22,7 @@ LEAF_FINE, LEAF_COARSE, MESH, TWIGS = range(4)
 """Cut-out textures."""
 UNIT = 128.0
 """Texel value that stands for a factor of 1."""
-GAMMA = 1 / 1.6
+GAMMA = 1 / 1.1
 """Grey levels are coded as linear ** GAMMA; a product of coded levels is the coded product."""
 
 
@@ -142,7 +142,7 @@ def load() -> Textures:
     leaf = np.clip(_grain(rng, 0.5, 0.35, 0.15, 2.2) ** GAMMA * UNIT, 1, 255)
     yy, xx = np.mgrid[:SIZE, :SIZE]
     mesh = ((xx + yy) % 32 < 5) | ((xx - yy) % 32 < 5)
-    masks = [_blobs(rng, 2.5, 16, 0.55), _blobs(rng, 4, 30, 0.65), mesh, _twigs(rng)]
+    masks = [_blobs(rng, 3.5, 16, 0.7), _blobs(rng, 5, 30, 0.75), mesh, _twigs(rng)]
     shades = [leaf, leaf, np.full_like(leaf, UNIT), np.full_like(leaf, UNIT)]
     cutouts = [np.where(m, s, 0).astype(np.int32).ravel() for m, s in zip(masks, shades, strict=True)]
     return Textures(np.concatenate(packed), np.array(offsets, np.int64), np.stack(cutouts))

@@ -52,16 +52,16 @@ class Style:
 
 STYLES: dict[str, Style] = {
     "downtown": Style(
-        15, (11, 17.5), 1.0, 310, 155.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True
+        15, (11, 17.5), 1.0, 310, 145.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True
     ),
     "suburb": Style(
-        19, (20, 45), 0.75, 250, 135.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
+        19, (20, 45), 0.75, 245, 124.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
     ),
     "park": Style(
-        19, (20, 45), 0.3, 250, 135.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
+        19, (20, 45), 0.3, 245, 124.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
     ),
     "rural": Style(
-        19, (14, 40), 0.2, 205, 108.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False
+        19, (14, 40), 0.2, 200, 98.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False
     ),
 }
 _HIGHWAYS = ("highway", "merge", "exit")
@@ -219,10 +219,10 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
     b.trees(belt[~built], (0.9, 1.75))
 
     row, _ = b.along(s.tree_spacing, s.tree_setback, 1.0, 0.4)
-    b.trees(row, (0.7, 1.55))
+    b.trees(row, (0.8, 1.95))
     b.ground.shadow(row, 2.5, rng)
     if s.second_row is not None:
-        b.trees(b.along(1.1 * s.tree_spacing, s.second_row, 0.8, 0.5)[0], (0.7, 1.55))
+        b.trees(b.along(1.1 * s.tree_spacing, s.second_row, 0.8, 0.5)[0], (0.8, 1.95))
 
     b.add(b.variants(models.bush), *b.along(22, (2, 5), s.bush_share, 0.6), (0.6, 1.6), (0.25, 0.5))
     poles = [models.pole(rng, lamp=i % 3 > 0) for i in range(_VARIANTS)]
