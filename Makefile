@@ -1,7 +1,7 @@
 # make compare   compare trigger policies on test sequences: a table, curves, a page (no torch needed)
 # make test      ruff, mypy and the whole test suite
 # make bench     time every stage, write docs/performance.md
-# make realism   print how close the scenes are to the published figures
+# make realism   measure how close the scenes are to the published figures
 # Every target first creates .venv and installs what it needs, once.
 
 PYTHON ?= python3
@@ -33,7 +33,7 @@ bench: .venv/.report
 
 realism: .venv/.report
 	@$(COMPILING)
-	$(BIN)/python scripts/realism.py
+	$(BIN)/python scripts/realism.py --overwrite
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

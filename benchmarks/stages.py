@@ -249,7 +249,7 @@ def markdown(report: dict[str, Any], command: str) -> str:
     ]
     for stage, meaning in STAGES.items():
         times = [report["stages"].get(stage) for report in resolutions.values()]
-        cells = [f"{t['median_ms']:.3g} ({t['min_ms']:.3g})" if t else "-" for t in times]
+        cells = [f"{_shown(t['median_ms'])} ({_shown(t['min_ms'])})" if t else "-" for t in times]
         lines.append(f"| {stage} | {' | '.join(cells)} | {meaning} |")
     lines += [
         "",
@@ -271,6 +271,10 @@ def markdown(report: dict[str, Any], command: str) -> str:
         f"counted: one {processes['one']:,.0f} steps/s, two together {processes['two']:,.0f} steps/s.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _shown(ms: float) -> str:
+    return f"{ms:.0f}" if ms >= 100 else f"{ms:.3g}"
 
 
 def _rounded(value: Any) -> float:

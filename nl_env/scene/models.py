@@ -13,10 +13,6 @@ import numpy as np
 from nl_env.scene import textures as tex
 from nl_env.scene.quads import QuadBuilder, Quads
 
-LEAF_TILE = 12.0
-"""Metres per repeat of the leaf textures near the road: holes of about 10 to 80 cm. Trees that are only
-seen from afar get coarser holes, as their leaves merge."""
-
 
 def building(rng: np.random.Generator, style: str) -> Quads:
     """A house, its front at -y: tall and flat-roofed downtown, low with a gable roof elsewhere."""
@@ -64,18 +60,18 @@ def building(rng: np.random.Generator, style: str) -> Quads:
     return b.build()
 
 
-def tree(rng: np.random.Generator, cards: int, leaf_tile: float, conifer: bool = False) -> Quads:
+def tree(rng: np.random.Generator, cards: int, leaves: tuple[int, int], conifer: bool = False) -> Quads:
     """A tree about 8 m high: two crossed trunk planes and ``cards`` leaf planes with holes in the canopy."""
     b = QuadBuilder()
     height = 8.0
-    radius, clear = height * rng.uniform(0.24, 0.38), height * rng.uniform(0.22, 0.4)
+    radius, clear = height * rng.uniform(0.24, 0.38), height * rng.uniform(0.3, 0.42)
     for angle in (0.0, math.pi / 2):
         side = 0.28 * np.array([math.cos(angle), math.sin(angle), 0.0])
         b.quad(-side / 2, side, (0, 0, 0.7 * height), 0.18, tex.ROUGH, (1, 6))
     half = (height - clear) / 2
     # Few planes have to be large to fill the canopy; many small ones look better from near by.
     spread = 1 - 1 / math.sqrt(cards)
-    size = radius * (0.55 + 0.9 / math.sqrt(cards))
+    size = radius * (0.6 + 1.0 / math.sqrt(cards))
     for _ in range(cards):
         if conifer:
             level, angle = rng.uniform(0, 1), rng.uniform(0, 2 * math.pi)
@@ -103,10 +99,9 @@ def tree(rng: np.random.Generator, cards: int, leaf_tile: float, conifer: bool =
         c /= np.linalg.norm(c)
         s = size * rng.uniform(0.75, 1.2)
         lit = 0.6 + 0.5 * centre[2] / 10 + rng.uniform(-0.25, 0.25)
-        repeat = 2 * s / leaf_tile
         b.quad(
-            centre - s * a - s * c, 2 * s * a, 2 * s * c, lit, int(rng.integers(2)), (repeat, repeat),
-            (rng.uniform(), rng.uniform()), cutout=True,
+            centre - s * a - s * c, 2 * s * a, 2 * s * c, lit, int(rng.choice(leaves)), (0.996, 0.996),
+            cutout=True,
         )  # fmt: skip
     return b.build()
 
@@ -135,8 +130,8 @@ def bush(rng: np.random.Generator) -> Quads:
         c /= np.linalg.norm(c)
         s = rng.uniform(0.6, 1.0)
         b.quad(
-            centre - s * a - s * c, 2 * s * a, 2 * s * c, rng.uniform(0.5, 0.9), int(rng.integers(2)),
-            (2 * s / LEAF_TILE, 2 * s / LEAF_TILE), (rng.uniform(), rng.uniform()), cutout=True,
+            centre - s * a - s * c, 2 * s * a, 2 * s * c, rng.uniform(0.5, 0.9),
+            int(rng.choice(tex.LEAVES_NEAR)), (0.996, 0.996), cutout=True,
         )  # fmt: skip
     return b.build()
 

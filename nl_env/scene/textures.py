@@ -18,8 +18,8 @@ SIZE = 256
 LEVELS = 7
 ROUGH, WINDOW, BRICK, DETAIL, CAR, PLANK, SKY = range(7)
 """Surface textures."""
-LEAF_FINE, LEAF_COARSE, MESH, TWIGS = range(4)
-"""Cut-out textures."""
+LEAVES_NEAR, LEAVES_FAR, MESH, TWIGS = (0, 1), (2, 3), 4, 5
+"""Cut-out textures; leaves come in two clumps for near and two with coarser holes for far trees."""
 UNIT = 128.0
 """Texel value that stands for a factor of 1."""
 GAMMA = 1 / 1.1
@@ -99,10 +99,15 @@ def _surfaces(rng: np.random.Generator) -> list[NDArray[np.float32]]:
     return [rough, window, brick, detail, car, plank, sky]
 
 
-def _blobs(rng: np.random.Generator, fine: float, coarse: float, filled: float) -> NDArray[np.bool_]:
+def _crown(rng: np.random.Generator, fine: float, coarse: float, filled: float) -> NDArray[np.bool_]:
+    """A ragged round clump of leaves: noise at two scales (texels), thinning out towards the rim."""
     layers = [gaussian_filter(rng.standard_normal((SIZE, SIZE)), s, mode="wrap") for s in (fine, coarse)]
     mixed = layers[0] / layers[0].std() + 0.8 * layers[1] / layers[1].std()
-    return mixed > np.quantile(mixed, 1 - filled)
+    yy, xx = np.mgrid[:SIZE, :SIZE] * (2.0 / SIZE) - 1.0
+    radius = np.hypot(xx, yy)
+    mixed -= 3.0 * np.clip(radius - 0.55, 0, None)
+    inside = radius < 0.97
+    return inside & (mixed > np.quantile(mixed[inside], 1 - filled))
 
 
 def _twigs(rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -142,7 +147,13 @@ def load() -> Textures:
     leaf = np.clip(_grain(rng, 0.5, 0.35, 0.15, 2.2) ** GAMMA * UNIT, 1, 255)
     yy, xx = np.mgrid[:SIZE, :SIZE]
     mesh = ((xx + yy) % 32 < 5) | ((xx - yy) % 32 < 5)
-    masks = [_blobs(rng, 3.5, 16, 0.7), _blobs(rng, 5, 30, 0.75), mesh, _twigs(rng)]
-    shades = [leaf, leaf, np.full_like(leaf, UNIT), np.full_like(leaf, UNIT)]
+    masks = [
+        *(_crown(rng, 5, 24, 0.72) for _ in LEAVES_NEAR),
+        *(_crown(rng, 9, 40, 0.75) for _ in LEAVES_FAR),
+        mesh,
+        _twigs(rng),
+    ]
+    plain = np.full_like(leaf, UNIT)
+    shades = [leaf] * 4 + [plain] * 2
     cutouts = [np.where(m, s, 0).astype(np.int32).ravel() for m, s in zip(masks, shades, strict=True)]
     return Textures(np.concatenate(packed), np.array(offsets, np.int64), np.stack(cutouts))

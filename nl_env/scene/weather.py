@@ -87,9 +87,9 @@ def preset(name: str) -> Weather:
     if sunset:
         return Weather(
             math.radians(12),
-            0.8 * ambient,
-            0.62 * exposure,
-            0.72 * sky,
+            0.9 * ambient,
+            0.78 * exposure,
+            0.8 * sky,
             clouds,
             fog,
             wetness,

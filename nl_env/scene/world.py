@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.scene import models
+from nl_env.scene import textures as tex
 from nl_env.scene.ground import Ground
 from nl_env.scene.quads import Objects, Quads, assemble, place
 from nl_env.scene.render import GroundMap
@@ -30,7 +31,7 @@ class Style:
             ego's path, and the share of houses. Nothing stands further out.
         tree_spacing, tree_setback: first row of trees.
         second_row: setback of a second row of trees, None for no such row.
-        bush_share, furniture_share, parked_share, fence_share, barrier_share, kerbs: roadside things.
+        bush_share, furniture_share, parked_share, fence_share, kerbs: roadside things.
     """
 
     building_spacing: float
@@ -46,32 +47,27 @@ class Style:
     furniture_share: float
     parked_share: float
     fence_share: float
-    barrier_share: float
     kerbs: bool
 
 
 STYLES: dict[str, Style] = {
-    "downtown": Style(
-        15, (11, 17.5), 1.0, 310, 145.0, 0.45, 33, (3, 6.5), None, 0.1, 0.7, 0.35, 0.06, 0.0, True
-    ),
+    "downtown": Style(15, (11, 17.5), 1.0, 310, 145.0, 0.45, 33, (4, 7), None, 0.1, 0.7, 0.35, 0.06, True),
     "suburb": Style(
-        19, (20, 45), 0.75, 245, 124.0, 0.45, 27, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
+        19, (20, 45), 0.75, 245, 124.0, 0.45, 27, (4.5, 16), (17, 55), 0.25, 0.7, 0.35, 0.2, True
     ),
-    "park": Style(
-        19, (20, 45), 0.3, 245, 124.0, 0.45, 16, (3.8, 15), (17, 55), 0.25, 0.7, 0.35, 0.2, 0.0, True
-    ),
-    "rural": Style(
-        19, (14, 40), 0.2, 200, 98.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, 0.25, False
-    ),
+    "park": Style(19, (20, 45), 0.3, 245, 124.0, 0.45, 16, (4.5, 16), (17, 55), 0.25, 0.7, 0.35, 0.2, True),
+    "rural": Style(19, (14, 40), 0.2, 200, 98.0, 0.12, 25, (5.5, 20), (15, 45), 0.25, 0.3, 0.0, 0.2, False),
 }
 _HIGHWAYS = ("highway", "merge", "exit")
 _TREE_LEVELS = (
-    (0.0, 14.0, 3, 3.0 * models.LEAF_TILE),
-    (14.0, 45.0, 6, 1.5 * models.LEAF_TILE),
-    (45.0, np.inf, 12, models.LEAF_TILE),
+    (0.0, 14.0, 3, tex.LEAVES_FAR),
+    (14.0, 45.0, 6, tex.LEAVES_FAR),
+    (45.0, np.inf, 12, tex.LEAVES_NEAR),
 )
-"""Canopy radius in pixels at the nearest sight (from, below), leaf planes, metres per leaf texture."""
+"""Canopy radius in pixels at the nearest sight (from, below), leaf planes, their textures."""
 _STEP = 1.5
+_BARRIERS = 0.95
+"""Share of a highway's edges that has a guard rail."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +102,17 @@ class _Builder:
         return np.asarray(np.sqrt(((points[:, None] - path[None]) ** 2).sum(2)).min(1))
 
     def along(
-        self, spacing: float, setback: tuple[float, float], share: float = 1.0, jitter: float = 0.3
+        self,
+        spacing: float,
+        setback: tuple[float, float],
+        share: float = 1.0,
+        jitter: float = 0.3,
+        half_length: float = 0.0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Points beside the roads and yaw angles that turn a template's -y towards the road."""
+        """Points beside the roads and yaw angles that turn a template's -y towards the road.
+
+        What reaches ``half_length`` metres along the road keeps both ends off every lane.
+        """
         points, yaws = [], []
         for lane in self.lanes:
             length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(lane.points, axis=0), axis=1))]
@@ -128,6 +132,10 @@ class _Builder:
                 at = centre + normal * (lane.width / 2 + offset)[:, None]
                 # Beside another lane is in somebody's way: a step further out must be further off the road.
                 clear = self.ground.field(at + _STEP * normal) >= offset + 0.1
+                if half_length:
+                    ahead = half_length * np.stack([np.cos(heading), np.sin(heading)], 1)
+                    for end in (at + ahead, at - ahead):
+                        clear &= self.ground.field(end) >= offset - 0.8
                 points.append(at[clear])
                 yaws.append(heading[clear] + (0.0 if side > 0 else np.pi))
         if not points:
@@ -169,10 +177,10 @@ class _Builder:
     def trees(self, points: NDArray[np.float64], scale: tuple[float, float]) -> None:
         """Trees with as many leaf planes as their nearest sight deserves; no level changes during a drive."""
         seen = self.focal * 2.6 / np.maximum(self.path_distance(points), 4.0) if len(points) else np.zeros(0)
-        for low, high, cards, tile in _TREE_LEVELS:
+        for low, high, cards, leaves in _TREE_LEVELS:
             at = points[(seen >= low) & (seen < high)]
             if len(at):
-                kinds = [models.tree(self.rng, cards, tile, conifer=i % 4 == 3) for i in range(_VARIANTS)]
+                kinds = [models.tree(self.rng, cards, leaves, conifer=i % 4 == 3) for i in range(_VARIANTS)]
                 if low > 14.0:
                     kinds.append(models.bare_tree(self.rng))
                 self.add(kinds, at, self.rng.uniform(0, 2 * np.pi, len(at)), scale, (0.25, 0.5))
@@ -224,17 +232,17 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
     if s.second_row is not None:
         b.trees(b.along(1.1 * s.tree_spacing, s.second_row, 0.8, 0.5)[0], (0.8, 1.95))
 
-    b.add(b.variants(models.bush), *b.along(22, (2, 5), s.bush_share, 0.6), (0.6, 1.6), (0.25, 0.5))
+    highway = traffic.scenario in _HIGHWAYS
+    b.add(b.variants(models.bush), *b.along(22, (3, 6), s.bush_share, 0.6), (0.6, 1.6), (0.25, 0.5))
     poles = [models.pole(rng, lamp=i % 3 > 0) for i in range(_VARIANTS)]
     b.add(poles, *b.along(40, (0.5, 1.2), 0.9))
     b.add(b.variants(models.sign, 3), *b.along(45, (0.4, 1.2), 0.6, 0.5))
     b.add(b.variants(models.furniture), *b.along(25, (0.8, 3.2), s.furniture_share, 0.5))
     b.add(b.variants(models.fence), *b.along(5.2, (3.6, 4.4), s.fence_share, 0.0))
-    barriers = max(s.barrier_share, 0.5 if traffic.scenario in _HIGHWAYS else 0.0)
-    b.add([models.barrier()], *b.along(4, (0.6, 0.7), barriers, 0.0))
-    if s.parked_share and traffic.scenario not in _HIGHWAYS:
+    b.add([models.barrier()], *b.along(4, (0.6, 0.7), _BARRIERS if highway else 0.0, 0.0, 2.0))
+    if s.parked_share and not highway:
         cars = [models.car(rng, 4.6, 1.85, 1.45) for _ in range(_VARIANTS)]
-        b.add(cars, *b.along(6.5, (1.35, 1.5), s.parked_share, 0.1))
+        b.add(cars, *b.along(6.5, (1.4, 1.55), s.parked_share, 0.1, 2.5))
     if s.kerbs:
         b.add([models.kerb()], *b.along(4, (0.5, 0.55), 1.0, 0.0))
 
