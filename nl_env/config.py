@@ -123,7 +123,7 @@ class EventCameraConfig:
             refractory_us=250,
             leak_rate_hz=0.1,
             shot_rate_hz=1.0,
-            cutoff_hz=300.0,
+            cutoff_hz=2000.0,
         )
 
 

@@ -22,7 +22,7 @@ LEAVES_NEAR, LEAVES_FAR, MESH, TWIGS = (0, 1), (2, 3), 4, 5
 """Cut-out textures; leaves come in two clumps for near and two with coarser holes for far trees."""
 UNIT = 128.0
 """Texel value that stands for a factor of 1."""
-GAMMA = 1 / 1.1
+GAMMA = 1 / 1.05
 """Grey levels are coded as linear ** GAMMA; a product of coded levels is the coded product."""
 
 
@@ -71,7 +71,7 @@ def _grain(
 
 
 def _surfaces(rng: np.random.Generator) -> list[NDArray[np.float32]]:
-    rough = _grain(rng, 0.22, 0.6, 0.3, 1.8)
+    rough = _grain(rng, 0.19, 0.6, 0.35, 1.75)
 
     window = _grain(rng, 0.08, 0.8, 0.5, 1.5)
     window[60:200, 60:196] = 0.22
@@ -85,7 +85,7 @@ def _surfaces(rng: np.random.Generator) -> list[NDArray[np.float32]]:
         for column in range(16 * (row // 16 % 2), SIZE, 32):
             brick[row : row + 16, column : column + 2] *= 1.35
 
-    detail = _grain(rng, 0.28, 0.45, 0.3, 1.9)
+    detail = _grain(rng, 0.22, 0.45, 0.35, 1.8)
 
     car = _grain(rng, 0.05, 0.8, 0.6, 1.4)
     car[40:120, 20:236] = 0.18
@@ -144,7 +144,7 @@ def load() -> Textures:
             start += packed[-1].size
             image = halve(image)
         offsets.append(row)
-    leaf = np.clip(_grain(rng, 0.5, 0.35, 0.15, 2.2) ** GAMMA * UNIT, 1, 255)
+    leaf = np.clip(_grain(rng, 0.44, 0.35, 0.2, 1.95) ** GAMMA * UNIT, 1, 255)
     yy, xx = np.mgrid[:SIZE, :SIZE]
     mesh = ((xx + yy) % 32 < 5) | ((xx - yy) % 32 < 5)
     masks = [

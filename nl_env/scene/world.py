@@ -227,10 +227,10 @@ def build(traffic: Traffic, style: str, weather: Weather, focal: float, rng: np.
     b.trees(belt[~built], (0.9, 1.75))
 
     row, _ = b.along(s.tree_spacing, s.tree_setback, 1.0, 0.4)
-    b.trees(row, (0.8, 1.95))
+    b.trees(row, (0.8, 1.75))
     b.ground.shadow(row, 2.5, rng)
     if s.second_row is not None:
-        b.trees(b.along(1.1 * s.tree_spacing, s.second_row, 0.8, 0.5)[0], (0.8, 1.95))
+        b.trees(b.along(1.1 * s.tree_spacing, s.second_row, 0.8, 0.5)[0], (0.8, 1.75))
 
     highway = traffic.scenario in _HIGHWAYS
     b.add(b.variants(models.bush), *b.along(22, (3, 6), s.bush_share, 0.6), (0.6, 1.6), (0.25, 0.5))
