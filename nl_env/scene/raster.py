@@ -168,15 +168,33 @@ def _edge(table, r, e, p0, px, py):
 
 
 @njit(**INLINE)
-def _span(table, r, y):
-    """First and last pixel of the quad of draw-list row ``r`` on image row ``y``."""
-    low, high = table[r, LEFT], table[r, RIGHT]
-    for e in range(4):
-        x = table[r, u8(EDGE + e)] + table[r, u8(SLOPE + e)] * y
-        inside_right = table[r, u8(SIDE + e)] > 0.0
-        low = max(low, x if inside_right else low)
-        high = min(high, high if inside_right else x)
-    return low, high
+def _edges(table, r):
+    """The bounds of draw-list row ``r`` as values, so that they stay in registers while rows are filled."""
+    return (
+        table[r, LEFT], table[r, RIGHT],
+        table[r, EDGE], table[r, SLOPE], table[r, SIDE],
+        table[r, EDGE + 1], table[r, SLOPE + 1], table[r, SIDE + 1],
+        table[r, EDGE + 2], table[r, SLOPE + 2], table[r, SIDE + 2],
+        table[r, EDGE + 3], table[r, SLOPE + 3], table[r, SIDE + 3],
+    )  # fmt: skip
+
+
+@njit(**INLINE)
+def _narrow(low, high, edge, slope, side, y):
+    """Cut the span at one edge."""
+    x = edge + slope * y
+    inside_right = side > 0.0
+    return max(low, x if inside_right else low), min(high, high if inside_right else x)
+
+
+@njit(**INLINE)
+def _span(edges, y):
+    """First and last pixel of a quad on image row ``y``."""
+    low, high, e0, s0, d0, e1, s1, d1, e2, s2, d2, e3, s3, d3 = edges
+    low, high = _narrow(low, high, e0, s0, d0, y)
+    low, high = _narrow(low, high, e1, s1, d1, y)
+    low, high = _narrow(low, high, e2, s2, d2, y)
+    return _narrow(low, high, e3, s3, d3, y)
 
 
 @njit(**FAST)
@@ -194,13 +212,15 @@ def rasterise(first, last, used, table, cutouts, inverse_depth, index, texel_at,
             _fill_cutout(table, row, y0, y1, cutouts, inverse_depth, index, texel_at, texel)
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _fill_opaque(table, r, first, last, inverse_depth, index):
     """Depth-test an opaque quad on image rows ``first`` to ``last`` and write its index."""
     label = i4(i4(r) + i4(1))
-    step = f4(table[r, WX])
+    edges = _edges(table, r)
+    w0, wx, wy = table[r, W0], table[r, WX], table[r, WY]
+    step = f4(wx)
     for row in range(first, last + 1):
-        low, high = _span(table, r, float(row))
+        low, high = _span(edges, float(row))
         # Compared before they become integers: the ends of an empty span can be astronomically far.
         if high < low - 1e-3:
             continue
@@ -209,7 +229,7 @@ def _fill_opaque(table, r, first, last, inverse_depth, index):
         n = math.floor(high + 1e-4) + 1 - x0
         if n <= 0:
             continue
-        start = f4(table[r, W0] + table[r, WY] * row + table[r, WX] * x0)
+        start = f4(w0 + wy * row + wx * x0)
         y, left = u8(row), u8(x0)
         for x in range(n):
             at = left + u8(x)
@@ -220,26 +240,29 @@ def _fill_opaque(table, r, first, last, inverse_depth, index):
             index[y, at] = label if closer else index[y, at]
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _fill_cutout(table, r, first, last, cutouts, inverse_depth, index, texel_at, texel):
     """Depth-test a quad with holes and write its row number and texel."""
     texture = u8(table[r, TEXTURE])
     scale_u, scale_v = table[r, REPEAT_U] * SIZE, table[r, REPEAT_V] * SIZE
     shift_u, shift_v = f4(table[r, SHIFT_U] * SIZE), f4(table[r, SHIFT_V] * SIZE)
-    step = f4(table[r, WX])
-    step_a, step_b = f4(table[r, AX] * scale_u), f4(table[r, BX] * scale_v)
+    edges = _edges(table, r)
+    w0, wx, wy = table[r, W0], table[r, WX], table[r, WY]
+    a0, ax, ay = table[r, A0] * scale_u, table[r, AX] * scale_u, table[r, AY] * scale_u
+    b0, bx, by = table[r, B0] * scale_v, table[r, BX] * scale_v, table[r, BY] * scale_v
+    step, step_a, step_b = f4(wx), f4(ax), f4(bx)
     base = i4(CUTOUT - (i4(r) << i4(8)))
     for row in range(first, last + 1):
-        low, high = _span(table, r, float(row))
+        low, high = _span(edges, float(row))
         if high < low:
             continue
         x0 = math.ceil(low)
         n = math.floor(high) + 1 - x0
         if n <= 0:
             continue
-        start = f4(table[r, W0] + table[r, WY] * row + table[r, WX] * x0)
-        start_a = f4((table[r, A0] + table[r, AY] * row + table[r, AX] * x0) * scale_u)
-        start_b = f4((table[r, B0] + table[r, BY] * row + table[r, BX] * x0) * scale_v)
+        start = f4(w0 + wy * row + wx * x0)
+        start_a = f4(a0 + ay * row + ax * x0)
+        start_b = f4(b0 + by * row + bx * x0)
         # Three loops, so that all but the look-up run in SIMD.
         for x in range(n):
             fx = f4(i4(x))

@@ -51,7 +51,7 @@ def _mip_level(texels, levels):
     return level
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _surface_run(y, x0, x1, fx, table, row, offsets, inverse_depth, at, fa, fb, gain, bias):
     """A run on the surface of draw-list row ``row``: one grey, or a mip-mapped texture."""
     grey = f4(table[row, r.GREY])
@@ -92,7 +92,7 @@ def _surface_run(y, x0, x1, fx, table, row, offsets, inverse_depth, at, fa, fb, 
         bias[x] = ZERO
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _ground_run(y, x0, x1, rays, eye, footprint, ground_map, layout, corner, texel, offsets, light,
                 inverse_depth, at, fa, fb, gain, bias):  # fmt: skip
     """A run of ground: the painted map, times a repeating detail texture, under a glossy film when wet."""
@@ -148,7 +148,7 @@ def _ground_run(y, x0, x1, rays, eye, footprint, ground_map, layout, corner, tex
         at[x] = u4(offset + (((iv & mask) << bits) | (iu & mask)))
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _sky_run(x0, x1, rays, up, brightness, zenith, clouds, offset, at, fa, fb, gain, bias):
     """A run of sky: a vertical gradient under a flat layer of clouds."""
     sx, sy, tx, ty = rays
@@ -184,7 +184,7 @@ def _exp_negative(x):
     return ONE / (y * y)
 
 
-@njit(**FAST)
+@njit(**INLINE)
 def _finish_row(y, packed, fog, haze, inverse_depth, at, fa, fb, gain, bias, shade):
     """Look the row's texels up, blend them, and fade them into the fog; the sky (``w = 0``) stays clear."""
     n = shade.shape[1]
