@@ -6,7 +6,7 @@ import pytest
 from nl_env.scene.quads import Objects, QuadBuilder, assemble, empty_quads, place
 from nl_env.scene.render import FAR, GroundMap, Light, Renderer
 from nl_env.scene.scene import camera_pose
-from nl_env.scene.textures import BRICK, LEAF_FINE, noise
+from nl_env.scene.textures import BRICK, LEAVES_NEAR, noise
 from nl_env.types import Camera
 
 CAMERA = Camera.from_fov(120, 160, 76.0)
@@ -128,7 +128,7 @@ def test_leaves_have_holes_and_what_is_behind_shows_through():
         (10.0, -30.0, -30.0),
         (0, 60.0, 0),
         (0, 0, 60.0),
-        texture=LEAF_FINE,
+        texture=LEAVES_NEAR[0],
         cutout=True,
         repeat=(8.0, 8.0),
     )
