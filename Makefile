@@ -1,6 +1,6 @@
 # make compare   compare trigger policies on test sequences: a table, curves, a page (no torch needed)
 # make test      ruff, mypy and the whole test suite
-# make bench     time every stage, write docs/performance.md
+# make bench     time every stage, measure the extrapolators; writes docs/performance.md, docs/extrapolators.md
 # make realism   measure how close the scenes are to the published figures
 # Every target first creates .venv and installs what it needs, once.
 
@@ -9,7 +9,7 @@ WORKERS ?= 2
 BIN := .venv/bin
 COMPILING = find nl_env -name '*.nbi' | grep -q . || echo "compiling kernels, once (about a minute)" >&2
 
-.PHONY: compare test lint bench realism clean
+.PHONY: compare test lint bench realism recompile clean
 .DELETE_ON_ERROR:
 
 compare: .venv/.report
@@ -30,10 +30,15 @@ lint: .venv/.dev
 bench: .venv/.report
 	@$(COMPILING)
 	$(BIN)/python benchmarks/stages.py --json docs/performance.json --markdown docs/performance.md
+	$(BIN)/python benchmarks/extrapolators.py --markdown docs/extrapolators.md > docs/extrapolators.json
 
 realism: .venv/.report
 	@$(COMPILING)
 	$(BIN)/python scripts/realism.py --overwrite
+
+# Numba's cache watches each kernel's own file: after editing one that others call, start afresh.
+recompile:
+	find nl_env -name '*.nb[ic]' -delete
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
