@@ -95,7 +95,7 @@ def measure_world(seed: int, pairs: int) -> np.ndarray:
 
 
 def summarise(worlds: np.ndarray) -> dict[str, Any]:
-    """JSON-ready means, standard errors and changes against Repeat of ``(worlds, methods, gaps, metrics)``."""
+    """Means, standard errors, changes against Repeat of ``(worlds, methods, gaps, metrics)``; JSON-ready."""
     overall = np.concatenate([worlds, worlds.mean(2, keepdims=True)], axis=2)
     gaps = [*map(str, GAPS_MS), "mean"]
     mean, spread = overall.mean(0), overall.std(0, ddof=1) / np.sqrt(len(overall))
