@@ -150,28 +150,28 @@ def _ground_run(y, x0, x1, rays, eye, footprint, ground_map, layout, corner, tex
 
 @njit(**INLINE)
 def _sky_run(x0, x1, rays, up, brightness, zenith, clouds, offset, at, fa, fb, gain, bias):
-    """A run of sky: a vertical gradient under a flat layer of clouds."""
+    """A run of sky: a vertical gradient under a flat layer of clouds, at one height per row."""
     sx, sy, tx, ty = rays
-    ax, ay, az = f4(sx + tx * x0), f4(sy + ty * x0), f4(up[0] + up[1] * x0)
-    bx, by, bz = f4(tx), f4(ty), f4(up[1])
+    height = max(up, 0.0)
+    inverse = 30.0 / (height + 0.25)
+    au, bu = f4((sx + tx * x0) * inverse), f4(tx * inverse)
+    av, bv = f4((sy + ty * x0) * inverse), f4(ty * inverse)
     mask, start = i4(SIZE - 1), i4(offset)
-    level, change, contrast = f4(brightness), f4(zenith), f4(clouds)
+    grey = brightness * (1.0 + zenith * height / (height + 1.0))
+    cloud_gain, cloud_bias = f4(grey * clouds / UNIT), f4(grey * (1.0 - clouds))
     left = u8(x0)
     for i in range(x1 - x0):
         x = left + u8(i)
         fi = f4(i4(i))
-        height = max(az + bz * fi, ZERO)
-        inverse = f4(30) / (height + f4(0.25))
-        u = (ax + bx * fi) * inverse
-        v = (ay + by * fi) * inverse
+        u = au + bu * fi
+        v = av + bv * fi
         iu = _floor_int(u)
         iv = _floor_int(v)
         fa[x] = u - f4(iu)
         fb[x] = v - f4(iv)
         at[x] = u4(start + (((iv & mask) << i4(8)) | (iu & mask)))
-        grey = level * (ONE + change * height / (height + ONE))
-        gain[x] = grey * contrast * f4(1 / UNIT)
-        bias[x] = grey * (ONE - contrast)
+        gain[x] = cloud_gain
+        bias[x] = cloud_bias
 
 
 @njit(**INLINE)
@@ -241,7 +241,7 @@ def shade_rows(first, last, rotation, eye, lens, table, packed, offsets, ground_
                 )  # fmt: skip
             elif label == r.SKY_ID:
                 _sky_run(
-                    x, end, rays, (sz, tz), light.sky, light.zenith, light.clouds, offsets[SKY, 0],
+                    x, end, rays, sz + tz * width / 2, light.sky, light.zenith, light.clouds, offsets[SKY, 0],
                     at, fa, fb, gain, bias,
                 )  # fmt: skip
             else:
