@@ -167,3 +167,20 @@ def test_streaks_fall_only_in_rain(name):
     rain.draw(405_000, later)
     assert again.tobytes() == drawn.tobytes()
     assert (later.tobytes() != drawn.tobytes()) == ("Rain" in name)
+
+
+@pytest.mark.parametrize("scenario", ["intersection", "roundabout"])
+def test_no_vehicle_drives_through_a_parking_space(scenario):
+    drive = simulate(scenario, seed=3, duration_s=6.0)
+    builder = world._Builder(drive, "downtown", 100.0, np.random.default_rng(3))
+    spaces, yaws = builder.along(6.5, (1.4, 1.55), share=1.0, jitter=0.1, half_length=2.5)
+    assert len(spaces) > 20
+    vehicles = np.array([actor.kind != "pedestrian" for actor in drive.actors])
+    cos, sin = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+    for t in range(0, drive.duration_us + 1, 100_000):
+        ego = drive.ego(t)
+        centres = np.vstack([drive.actor_states(t)[vehicles, :2], (ego.x, ego.y)])
+        x, y = np.moveaxis(centres[None] - spaces[:, None], 2, 0)
+        along, across = np.abs(cos * x + sin * y), np.abs(cos * y - sin * x)
+        # Half a parked car and half the width of a driving one.
+        assert not ((along < 2.3 + 0.9) & (across < 0.93 + 0.9)).any()
