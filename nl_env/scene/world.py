@@ -66,6 +66,7 @@ _TREE_LEVELS = (
 )
 """Canopy radius in pixels at the nearest sight (from, below), leaf planes, their textures."""
 _STEP = 1.5
+"""How much further out, m, the ground is probed to tell the road's edge from the space between lanes."""
 _BARRIERS = 0.95
 """Share of a highway's edges that has a guard rail."""
 
@@ -181,7 +182,8 @@ class _Builder:
             at = points[(seen >= low) & (seen < high)]
             if len(at):
                 kinds = [models.tree(self.rng, cards, leaves, conifer=i % 4 == 3) for i in range(_VARIANTS)]
-                if low > 14.0:
+                if leaves == tex.LEAVES_NEAR:
+                    # Seen from afar, twigs would only flicker.
                     kinds.append(models.bare_tree(self.rng))
                 self.add(kinds, at, self.rng.uniform(0, 2 * np.pi, len(at)), scale, (0.25, 0.5))
 
