@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,6 +59,12 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def remove_temporaries(folder: Path) -> None:
+    """Delete what killed processes left of unfinished writes through :func:`replacing` in ``folder``."""
+    for temporary in folder.glob(".*"):
+        temporary.unlink(missing_ok=True)
+
+
 def open_folder(
     folder: Path, settings: dict[str, Any], *, overwrite: bool = False, resume: bool = False
 ) -> Path:
@@ -96,6 +102,7 @@ def open_folder(
                 f"{key} is {found.get(key)!r}, asked {wanted.get(key)!r}" for key in changed
             )
             raise ValueError(f"resume: {folder} holds a run with other settings: {differences}")
+        remove_temporaries(checkpoints)
     elif any(folder.iterdir()):
         if not overwrite:
             what = "another run" if marker.exists() else "files that are not a run's"
@@ -117,6 +124,7 @@ def run_sequences(
     checkpoints: Path,
     *,
     workers: int = 0,
+    suffix: str = ".npz",
     progress: Callable[[int], None] = lambda finished: None,
 ) -> list[Result]:
     """Run ``task`` on every seed that has no checkpoint yet and return all results in the order of ``seeds``.
@@ -129,6 +137,7 @@ def run_sequences(
         seeds: distinct sequence seeds.
         checkpoints: from :func:`open_folder`.
         workers: spawned processes of one thread each; 0 runs in this process.
+        suffix: of the checkpoints, ``<seed><suffix>``.
         progress: called with the number of newly finished sequences.
 
     Raises:
@@ -136,20 +145,32 @@ def run_sequences(
     """
     if workers < 0:
         raise ValueError(f"workers: found {workers}, expected 0 or more")
-    files = {seed: checkpoints / f"{seed}.npz" for seed in seeds}
+    files = {seed: checkpoints / f"{seed}{suffix}" for seed in seeds}
     missing = [seed for seed in seeds if not files[seed].exists()]
     progress(len(files) - len(missing))
-    finished = _in_processes(task, missing, workers) if workers else ((seed, task(seed)) for seed in missing)
-    for seed, result in finished:
-        with replacing(files[seed]) as temporary:
-            result.save(temporary)
-        progress(1)
+    finished = _in_processes(task, missing, workers) if workers else _in_this_process(task, missing)
+    try:
+        for seed, result in finished:
+            with replacing(files[seed]) as temporary:
+                result.save(temporary)
+            progress(1)
+    except BaseException:
+        finished.close()  # ends the workers
+        remove_temporaries(checkpoints)
+        raise
     return [load(files[seed]) for seed in seeds]
+
+
+def _in_this_process(
+    task: Callable[[int], Result], seeds: Sequence[int]
+) -> Generator[tuple[int, Result], None, None]:
+    for seed in seeds:
+        yield seed, task(seed)
 
 
 def _in_processes(
     task: Callable[[int], Result], seeds: Sequence[int], workers: int
-) -> Iterator[tuple[int, Result]]:
+) -> Generator[tuple[int, Result], None, None]:
     """Yield ``(seed, task(seed))`` as spawned workers finish; an interrupt ends them at once."""
     with _one_thread_each():
         pool = ProcessPoolExecutor(
@@ -163,8 +184,11 @@ def _in_processes(
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BaseException:
-            for child in set(multiprocessing.active_children()) - others:
+            children = set(multiprocessing.active_children()) - others
+            for child in children:
                 child.terminate()
+            for child in children:
+                child.join()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         pool.shutdown()

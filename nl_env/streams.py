@@ -1,4 +1,4 @@
-"""Streams of samples: a synthetic drive seen by an event camera and a LiDAR."""
+"""The live stream of samples: a synthetic drive seen by an event camera and a LiDAR."""
 
 from __future__ import annotations
 
@@ -8,15 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.config import DrivingConfig
-from nl_env.keyframes import NewActorDetector
 from nl_env.representations import frame_from_bins
-from nl_env.scene.scene import DrivingScene
-from nl_env.sensors.event_camera import EventCamera
 from nl_env.sensors.lidar import Lidar, quantise
-from nl_env.types import BINS, SLICE_US, TICK_US, TICKS_PER_SLICE, EgoState, Sample
-
-EVENT_CAMERA_STREAM = 1
-"""Spawn key that keeps the event camera's randomness apart from the scene's."""
+from nl_env.simulator import Simulator
+from nl_env.types import BINS, SLICE_US, TICKS_PER_SLICE, Sample
 
 
 class SyntheticStream:
@@ -32,46 +27,35 @@ class SyntheticStream:
         self.slices = self.config.scene.slices
         self.lidar_period = self.config.lidar.period
         self.max_depth = self.config.lidar.max_depth
-        self._scene: DrivingScene | None = None
-        self._event_camera = EventCamera(self.config.events, self.camera.shape)
         self._lidar = Lidar(self.config.lidar, self.camera)
-        self._new_actors = NewActorDetector(self.camera)
-        self._intensity = np.zeros(self.camera.shape, np.float32)
-        self._depth = np.zeros(self.camera.shape, np.float32)
+        self._simulator: Simulator | None = None
         self._index = 0
 
     def reset(self, seed: int) -> Sample:
         """Build the scene of ``seed`` and return sample 0."""
-        scene = DrivingScene(self.config.scene, self.camera, seed)
-        scene.render(0, self._intensity, self._depth)
-        event_seed = np.random.SeedSequence(seed, spawn_key=(EVENT_CAMERA_STREAM,))
-        self._event_camera.noise_scale = scene.noise_scale
-        self._event_camera.reset(self._intensity, 0, np.random.default_rng(event_seed))
-        self._new_actors.reset()
-        self._scene = scene
+        self._simulator = Simulator(self.config, seed)
         self._index = 0
-        return self._sample(scene, np.zeros((BINS, *self.camera.shape), np.int16), event_count=0)
+        return self._sample(self._simulator, np.zeros((BINS, *self.camera.shape), np.int16), event_count=0)
 
     def advance(self) -> Sample:
         """Simulate the next 20 ms; raises ``RuntimeError`` before ``reset`` or past the last sample."""
-        scene = self._running()
+        simulator = self._running()
         if self._index == self.slices:
             raise RuntimeError(f"the sequence ended at slice {self.slices}; call reset(seed) for another")
         start = self._index * SLICE_US
         bins = np.zeros((BINS, *self.camera.shape), np.int16)
         event_count = 0
         for tick in range(1, TICKS_PER_SLICE + 1):
-            t = start + tick * TICK_US
-            last = tick == TICKS_PER_SLICE
-            scene.render(t, self._intensity, self._depth if last else None)
-            event_count += self._event_camera.accumulate(self._intensity, t, bins, start)
+            simulator.tick(depth=tick == TICKS_PER_SLICE)
+            event_count += simulator.event_camera.accumulate(
+                simulator.intensity, simulator.t, bins, slice_start_us=start
+            )
         self._index += 1
-        return self._sample(scene, bins, event_count)
+        return self._sample(simulator, bins, event_count)
 
     def intensity(self) -> NDArray[np.float32]:
         """``(H, W)`` float32 in [0, 1]: what a frame camera would see now."""
-        self._running()
-        return np.clip(self._intensity, 0.0, 1.0)
+        return np.clip(self._running().intensity, 0.0, 1.0)
 
     def describe(self) -> dict[str, Any]:
         """Scenario, style, weather and seed of the running sequence, JSON-ready."""
@@ -79,31 +63,22 @@ class SyntheticStream:
 
     def close(self) -> None:
         """Drop the scene; may be called twice."""
-        self._scene = None
+        self._simulator = None
 
-    def _running(self) -> DrivingScene:
-        if self._scene is None:
+    def _running(self) -> Simulator:
+        if self._simulator is None:
             raise RuntimeError("no sequence is running; call reset(seed) first")
-        return self._scene
+        return self._simulator
 
-    def _sample(self, scene: DrivingScene, bins: NDArray[np.int16], event_count: int) -> Sample:
-        t = self._index * SLICE_US
-        depth = quantise(self._depth, self.max_depth)
-        pose = scene.pose(t)
-        state = EgoState(
-            pose=pose,
-            twist=scene.twist(t),
-            speed=float(scene.speed(t)),
-            shortest_distance=float(scene.shortest_distance(t)),
-            new_actors=self._new_actors.update(scene.actor_centres(t), pose, depth, t),
-        )
+    def _sample(self, simulator: Simulator, bins: NDArray[np.int16], event_count: int) -> Sample:
+        depth = quantise(simulator.depth, self.max_depth)
         return Sample(
             index=self._index,
-            t=t,
+            t=simulator.t,
             bins=bins,
             event_frame=frame_from_bins(bins),
             event_count=event_count,
             depth=depth,
             lidar=self._lidar.measure(depth) if self._index % self.lidar_period == 0 else None,
-            state=state,
+            state=simulator.state(depth),
         )
