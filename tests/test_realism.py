@@ -194,11 +194,11 @@ def test_divergence_of_known_gaussians():
 
 def test_checkpoint_statistics_are_those_of_its_inputs(pair, tmp_path):
     torch = pytest.importorskip("torch")
-    from nl_env.depth.unet import ReleasedNetwork
+    from nl_env.depth.unet import UNet
     from nl_env.realism.network import ReleasedProbe, batch_norm_distance
 
     torch.manual_seed(0)
-    network = ReleasedNetwork()
+    network = UNet()
     path = str(tmp_path / "network.pth")
     torch.save(network.state_dict(), path)
     probe = ReleasedProbe(path, GAPS)

@@ -1,34 +1,78 @@
-"""The released network of the paper: ``SUNet2EnResConv``, 16 channels, ReLU, and a loader for its weights.
+"""The paper's U-Net, ``SUNet2EnResConv``: as released, as its text has it, and in its ablation variants.
 
 Two stems (events and depth), three encoder levels and a bottleneck of residual blocks, transposed
 convolutions up again with skips, and SoftPlus at the end: depth in metres, without a return head.
-The released code's parallel branch is 3x3 where the paper's text says 1x1; this is the released one.
 Parameter names follow the released state dict, so that it loads as it is.
 """
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nl_env.config import choice, number
 from nl_env.types import BINS
+from nl_env.weight_files import Card, load_network, load_strictly, read_card, read_tensors
 
-CHANNELS = 16
+ARCHITECTURE = "unet-paper"
+"""Name of this family on cards."""
+
 STRIDE = 8
 """Image sides must be multiples of this (three poolings)."""
 
 
-class ConvBlock(nn.Module):
-    """3x3 convolution, batch norm; ReLU unless ``activate`` is False."""
+@dataclass(frozen=True)
+class UNetOptions:
+    """Which of the family. The defaults are the released network. Invalid values raise ``ValueError``."""
 
-    def __init__(self, inputs: int, outputs: int, activate: bool = True) -> None:
+    channels: int = 16
+    """Of the stems and of the first level."""
+    parallel_kernel: Literal[1, 3] = 3
+    """Kernel of the residual blocks' parallel branch: 3 as released, 1 as the paper's text says."""
+    inputs: Literal["voxel", "frame", "none"] = "voxel"
+    """What it sees of the events: the voxel grid, the event frame (its sum over bins), or nothing."""
+    fusion: Literal["stems", "concat"] = "stems"
+    """A stem for each input, or both concatenated as they are."""
+    skips: bool = True
+    """The residual blocks' parallel branch, which the paper's table calls skip connection."""
+
+    def __post_init__(self) -> None:
+        number("channels", self.channels, 1, 1024)
+        choice("parallel_kernel", self.parallel_kernel, (1, 3))
+        choice("inputs", self.inputs, ("voxel", "frame", "none"))
+        choice("fusion", self.fusion, ("stems", "concat"))
+        choice("skips", self.skips, (True, False))
+
+    @property
+    def event_channels(self) -> int:
+        """Planes of events that go in."""
+        return {"voxel": BINS, "frame": 1, "none": 0}[self.inputs]
+
+
+RELEASED = UNetOptions()
+VARIANTS = {
+    "released": RELEASED,
+    "paper": UNetOptions(parallel_kernel=1),
+    "without-events": UNetOptions(parallel_kernel=1, inputs="none"),
+    "event-frame": UNetOptions(parallel_kernel=1, inputs="frame"),
+    "data-concat": UNetOptions(parallel_kernel=1, fusion="concat"),
+    "without-skip": UNetOptions(parallel_kernel=1, skips=False),
+}
+"""The released network, and the rows of the paper's ablation table after its text's architecture."""
+
+
+class ConvBlock(nn.Module):
+    """Convolution, batch norm; ReLU unless ``activate`` is False."""
+
+    def __init__(self, inputs: int, outputs: int, activate: bool = True, kernel: int = 3) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+        self.conv = nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False)
         self.bn = nn.BatchNorm2d(outputs)
         self.activate = activate
 
@@ -54,44 +98,62 @@ class SeparableBlock(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """The paper's ResConv: convolution and separable convolution, plus a parallel convolution."""
+    """The paper's ResConv: convolution and separable convolution, plus a parallel convolution.
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    Args:
+        parallel_kernel: of the parallel convolution; 0 leaves it out.
+    """
+
+    def __init__(self, inputs: int, outputs: int, parallel_kernel: int) -> None:
         super().__init__()
         self.conv1 = ConvBlock(inputs, outputs)
         self.conv2 = SeparableBlock(outputs, outputs, activate=False)
-        self.conv3 = ConvBlock(inputs, outputs, activate=False)
+        self.conv3 = (
+            ConvBlock(inputs, outputs, activate=False, kernel=parallel_kernel) if parallel_kernel else None
+        )
 
     def forward(self, x: Tensor) -> Tensor:
-        return functional.relu(self.conv2(self.conv1(x)) + self.conv3(x))
+        deep = self.conv2(self.conv1(x))
+        return functional.relu(deep if self.conv3 is None else deep + self.conv3(x))
 
 
 class UpBlock(nn.Module):
     """Doubles the image, joins the encoder's features of that size, and mixes them."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, parallel_kernel: int) -> None:
         super().__init__()
         self.up = nn.ConvTranspose2d(inputs, outputs, 2, stride=2)
-        self.conv = ResidualBlock(inputs, outputs)
+        self.conv = ResidualBlock(inputs, outputs, parallel_kernel)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         return self.conv(torch.cat([self.up(x), skip], dim=1))
 
 
-class ReleasedNetwork(nn.Module):
-    """Depth now from the last LiDAR frame and the voxel grid of the events since."""
+class UNet(nn.Module):
+    """Depth now from the last LiDAR frame and the voxel grid of the events since.
 
-    def __init__(self, channels: int = CHANNELS) -> None:
+    Every variant takes the same inputs and uses what it has a use for.
+    """
+
+    def __init__(self, options: UNetOptions = RELEASED) -> None:
         super().__init__()
-        self.event_stem = SeparableBlock(BINS, channels)
-        self.depth_stem = ConvBlock(1, channels)
-        self.down1 = ResidualBlock(2 * channels, channels)
-        self.down2 = ResidualBlock(channels, 2 * channels)
-        self.down3 = ResidualBlock(2 * channels, 4 * channels)
-        self.bottleneck = ResidualBlock(4 * channels, 8 * channels)
-        self.up1 = UpBlock(8 * channels, 4 * channels)
-        self.up2 = UpBlock(4 * channels, 2 * channels)
-        self.up3 = UpBlock(2 * channels, channels)
+        self.options = options
+        channels, events = options.channels, options.event_channels
+        parallel = options.parallel_kernel if options.skips else 0
+        if options.fusion == "concat":
+            joined = events + 1
+        else:
+            if events:
+                self.event_stem = SeparableBlock(events, channels)
+            self.depth_stem = ConvBlock(1, channels)
+            joined = 2 * channels if events else channels
+        self.down1 = ResidualBlock(joined, channels, parallel)
+        self.down2 = ResidualBlock(channels, 2 * channels, parallel)
+        self.down3 = ResidualBlock(2 * channels, 4 * channels, parallel)
+        self.bottleneck = ResidualBlock(4 * channels, 8 * channels, parallel)
+        self.up1 = UpBlock(8 * channels, 4 * channels, parallel)
+        self.up2 = UpBlock(4 * channels, 2 * channels, parallel)
+        self.up3 = UpBlock(2 * channels, channels, parallel)
         self.head = nn.Conv2d(channels, 1, 1)
 
     def forward(self, depth: Tensor, voxel: Tensor) -> Tensor:
@@ -114,16 +176,51 @@ class ReleasedNetwork(nn.Module):
             raise ValueError(
                 f"voxel: found shape {tuple(voxel.shape)}, expected {(count, BINS, height, width)}"
             )
-        fused = torch.cat([self.event_stem(voxel), self.depth_stem(depth)], dim=1)
-        full = self.down1(fused)
+        full = self.down1(self._joined(depth, voxel))
         half = self.down2(functional.max_pool2d(full, 2))
         quarter = self.down3(functional.max_pool2d(half, 2))
         deepest = self.bottleneck(functional.max_pool2d(quarter, 2))
         x = self.up3(self.up2(self.up1(deepest, quarter), half), full)
         return functional.softplus(self.head(x))
 
+    def _joined(self, depth: Tensor, voxel: Tensor) -> Tensor:
+        """Both inputs as one stack of planes."""
+        events = voxel.sum(1, keepdim=True) if self.options.inputs == "frame" else voxel
+        if self.options.fusion == "concat":
+            return depth if self.options.inputs == "none" else torch.cat([events, depth], dim=1)
+        if self.options.inputs == "none":
+            return self.depth_stem(depth)
+        return torch.cat([self.event_stem(events), self.depth_stem(depth)], dim=1)
 
-def load_released(path: str | Path) -> ReleasedNetwork:
+
+def make_unet(**options: Any) -> UNet:
+    """The network of a card's options."""
+    return UNet(UNetOptions(**options))
+
+
+def unet_card(network: UNet, what: str, training: dict[str, Any] | None = None) -> Card:
+    """A card from which :func:`load_unet` rebuilds ``network``."""
+    return Card(what, ARCHITECTURE, options=asdict(network.options), training=training or {})
+
+
+def load_unet(path: str | Path) -> UNet:
+    """The network that the card beside ``path`` describes; without a card, the released one.
+
+    Nothing is unpickled but tensors. The network comes in evaluation mode.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no weights in it, of another architecture, or tensors that do not fit.
+    """
+    path = Path(path)
+    if read_card(path) is None:
+        return load_released(path)
+    network, _ = load_network(path, {ARCHITECTURE: make_unet})
+    assert isinstance(network, UNet)
+    return network
+
+
+def load_released(path: str | Path) -> UNet:
     """The released network with the weights of a ``.safetensors`` file or a PyTorch state dict.
 
     Nothing is unpickled but tensors. The network comes in evaluation mode.
@@ -133,13 +230,8 @@ def load_released(path: str | Path) -> ReleasedNetwork:
         ValueError: the file holds no state dict, or its tensors are not those of this architecture;
             the message names the missing, unexpected and misshapen ones.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"weights: found no file {str(path)!r}")
-    network = ReleasedNetwork()
-    tensors = _read_tensors(path)
-    _check_tensors(path, tensors, network.state_dict())
-    network.load_state_dict(tensors)
+    network = UNet()
+    load_strictly(network, read_tensors(Path(path)), Path(path))
     return network.eval()
 
 
@@ -151,38 +243,3 @@ def batch_norms(network: nn.Module) -> Iterator[tuple[str, nn.BatchNorm2d]]:
     for name, module in network.named_modules():
         if isinstance(module, nn.BatchNorm2d):
             yield name, module
-
-
-def _read_tensors(path: Path) -> dict[str, Tensor]:
-    if path.suffix == ".safetensors":
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
-        try:
-            return load_file(path)
-        except SafetensorError as cause:
-            raise ValueError(f"weights: found no safetensors data in {str(path)!r} ({cause})") from cause
-    try:
-        tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as cause:
-        raise ValueError(
-            f"weights: found no plain state dict in {str(path)!r}, expected .safetensors or a state dict"
-        ) from cause
-    if not isinstance(tensors, Mapping) or not all(isinstance(value, Tensor) for value in tensors.values()):
-        raise ValueError(f"weights: found {type(tensors).__name__} in {str(path)!r}, expected a state dict")
-    return dict(tensors)
-
-
-def _check_tensors(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    problems = {
-        "missing": sorted(expected.keys() - found.keys()),
-        "unexpected": sorted(found.keys() - expected.keys()),
-        "of another shape": sorted(
-            f"{name} {tuple(found[name].shape)} instead of {tuple(expected[name].shape)}"
-            for name in expected.keys() & found.keys()
-            if found[name].shape != expected[name].shape
-        ),
-    }
-    listed = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in problems.items() if names)
-    if listed:
-        raise ValueError(f"weights: {str(path)!r} does not fit the released network, {listed}")
