@@ -1,6 +1,6 @@
-# make compare   compare trigger policies on test sequences: a table, curves, a page (no torch needed)
+# make compare   compare trigger policies on test sequences: a table, curves, a page
 # make test      ruff, mypy and the whole test suite
-# make bench     time every stage, measure the extrapolators; writes docs/performance.md, docs/extrapolators.md
+# make bench     time every stage, the networks and their training; writes docs/performance.md and others
 # make realism   measure how close the scenes are to the published figures
 # Every target first creates .venv and installs what it needs, once.
 
@@ -27,10 +27,12 @@ lint: .venv/.dev
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: .venv/.report
+bench: .venv/.dev
 	@$(COMPILING)
 	$(BIN)/python benchmarks/stages.py --json docs/performance.json --markdown docs/performance.md
 	$(BIN)/python benchmarks/extrapolators.py --markdown docs/extrapolators.md > docs/extrapolators.json
+	$(BIN)/python benchmarks/inference.py --markdown docs/runtimes.md > docs/runtimes.json
+	$(BIN)/python benchmarks/training.py --markdown docs/training.md > docs/training.json
 
 realism: .venv/.report
 	@$(COMPILING)

@@ -18,11 +18,11 @@ from nl_env.keyframes import label_keyframe
 from nl_env.observations import event_frames
 
 Actions = NDArray[np.int64]
-Memory = NDArray[np.int64]
+Memory = NDArray[Any]
 
 
 class Policy(ABC):
-    """A rule that decides at every slice whether to trigger.
+    """Decides at every slice whether to trigger.
 
     Attributes:
         privileged: True if the policy looks at more than the observation.
@@ -43,7 +43,7 @@ class Policy(ABC):
             observation: of any ``obs_mode``, single or a batch of n.
             state: the second return value of the previous call; None starts anew.
             episode_start: ``(n,)`` bool, True where an environment has just been reset.
-            deterministic: no effect; the rules here have no second, noisier behaviour.
+            deterministic: no effect; the policies here have no second, noisier behaviour.
 
         Returns:
             ``(action, state)``: an ``np.int64`` for a single observation, ``(n,)`` int64 for a batch.
@@ -61,7 +61,7 @@ class Policy(ABC):
         return (actions if batched else actions[0]), memory
 
     def initial_memory(self, count: int) -> Memory:
-        """``(count, ...)`` int64 memory at the start of an episode; by default nothing."""
+        """``(count, ...)`` memory at the start of an episode, of any dtype; by default nothing."""
         return np.zeros((count, 0), dtype=np.int64)
 
     @abstractmethod

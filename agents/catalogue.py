@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from agents.base import Policy
 from agents.oracle import OptimalOracle
 from agents.rules import (
     Always,
+    Evenly,
     EventRate,
     EventRateHysteresis,
     GreedyDepthChange,
@@ -23,6 +25,7 @@ HYSTERESIS_RATIO = 0.7
 """The lower threshold of ``event-rate-hysteresis`` as a share of the upper one."""
 
 _ACTIVE_SHARES = (0.02, 0.05, 0.08, 0.11, 0.14, 0.17, 0.2, 0.23, 0.26, 0.3)
+_PROBABILITIES = (0.05, 0.15, 0.3, 0.45, 0.6, 0.75, 0.85, 0.92, 0.97)
 
 
 @dataclass(frozen=True)
@@ -30,16 +33,17 @@ class Family:
     """Policies of one kind.
 
     Attributes:
-        make: ``(parameter, seed) -> policy``; the seed is the sequence's.
+        make: ``(parameter, seed) -> policy``; the seed is the sequence's. The parameter is nan where there
+            is none.
         parameter: what the number after the colon means; empty when there is none.
-        default: the number used without a colon.
+        default: the number used without a colon; None leaves it to the policy.
         sweep: the numbers that draw the family's error-against-rate curve.
         adaptive: whether triggers depend on the scene.
     """
 
     make: Callable[[float, int], Policy]
     parameter: str = ""
-    default: float = 0.0
+    default: float | None = 0.0
     sweep: tuple[float, ...] = ()
     adaptive: bool = True
 
@@ -54,6 +58,13 @@ FAMILIES: dict[str, Family] = {
         (1, 2, 3, 4, 6, 8),
         adaptive=False,
     ),
+    "evenly": Family(
+        lambda rate_hz, seed: Evenly(rate_hz),
+        "effective rate with a LiDAR at 10 Hz, Hz",
+        40,
+        (10, 20, 30, 40, 50),
+        adaptive=False,
+    ),
     "random": Family(RandomTrigger, "probability", 0.5, (0.1, 0.3, 0.5, 0.7, 0.9), adaptive=False),
     "event-rate": Family(
         lambda threshold, seed: EventRate(threshold), "share of active pixels above", 0.15, _ACTIVE_SHARES
@@ -63,6 +74,18 @@ FAMILIES: dict[str, Family] = {
         "share of active pixels that starts triggering",
         0.18,
         _ACTIVE_SHARES,
+    ),
+    "keyframe-cnn": Family(
+        lambda threshold, seed: _keyframe_cnn("keyframe-cnn.safetensors", threshold),
+        "probability of a keyframe above; without it, as calibrated",
+        None,
+        _PROBABILITIES,
+    ),
+    "keyframe-cnn-temporal": Family(
+        lambda threshold, seed: _keyframe_cnn("keyframe-cnn-temporal.safetensors", threshold),
+        "probability of a keyframe above; without it, as calibrated",
+        None,
+        _PROBABILITIES,
     ),
     "keyframe-rule": Family(lambda _, seed: KeyframeRule()),
     "greedy": Family(
@@ -105,7 +128,14 @@ def policy_name(family: str, parameter: float | None) -> str:
 def make_policy(name: str, seed: int) -> Policy:
     """Build a policy by name; ``seed`` feeds the random ones. Errors as :func:`parse_policy`."""
     family, parameter = parse_policy(name)
-    return FAMILIES[family].make(0.0 if parameter is None else parameter, seed)
+    return FAMILIES[family].make(math.nan if parameter is None else parameter, seed)
+
+
+def _keyframe_cnn(weights: str, threshold: float) -> Policy:
+    """A learned detector of ``nl_env/weights``; importing PyTorch waits until one is asked for."""
+    from agents.keyframe_cnn import WEIGHTS, KeyframeCNN
+
+    return KeyframeCNN.load(WEIGHTS / weights, None if math.isnan(threshold) else threshold)
 
 
 def _whole(family: str, number: float) -> int:

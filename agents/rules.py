@@ -1,4 +1,4 @@
-"""Rules without learning: constant, periodic, random, event rates, and two privileged ones."""
+"""Rules without learning: constant, periodic, even, random, event rates, and two privileged ones."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Actions, Memory, Policy, PrivilegedPolicy, Truth
+from nl_env.types import SLICE_US
 
 EVENT_MEASURES = ("active", "count")
 
@@ -46,6 +47,33 @@ class Periodic(Policy):
     def decide(self, frames: NDArray[np.int16], memory: Memory) -> Actions:
         memory[:, 0] += 1
         return (memory[:, 0] % self.n == self.phase).astype(np.int64)
+
+
+class Evenly(Policy):
+    """Spread triggers evenly over the slices without a LiDAR frame, so that depth arrives at ``rate_hz``.
+
+    Args:
+        rate_hz: effective frame rate, Hz; from the LiDAR's own to one frame per slice.
+        lidar_period: slices between LiDAR frames (5 at 10 Hz).
+    """
+
+    def __init__(self, rate_hz: float, lidar_period: int = 5) -> None:
+        every_slice = 1e6 / SLICE_US
+        lidar_hz = every_slice / lidar_period
+        if not lidar_hz <= rate_hz <= every_slice:
+            raise ValueError(f"rate_hz: found {rate_hz!r}, expected {lidar_hz:g} to {every_slice:g}")
+        self.lidar_period = lidar_period
+        self.share = (rate_hz - lidar_hz) / (every_slice - lidar_hz)
+
+    def initial_memory(self, count: int) -> Memory:
+        return np.zeros((count, 1), dtype=np.int64)
+
+    def decide(self, frames: NDArray[np.int16], memory: Memory) -> Actions:
+        memory[:, 0] += 1
+        interval, offset = np.divmod(memory[:, 0], self.lidar_period)
+        free = interval * (self.lidar_period - 1) + offset  # slices without a LiDAR frame, this one included
+        due, before = (np.floor(n * self.share + 1e-9) for n in (free, free - 1))
+        return ((offset > 0) & (due > before)).astype(np.int64)
 
 
 class RandomTrigger(Policy):

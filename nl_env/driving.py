@@ -66,9 +66,12 @@ class DrivingEnv(AdaptiveDepthEnv):
     * `lidar_hz`: LiDAR frames per second: 1, 2, 5, 10 (default) or 25.
     * `beams`: scan lines of the LiDAR: 16, 32, 64, 128, or 0 (default) for a dense one.
     * `noise`: event camera, `"realistic"` (default) or `"ideal"`.
-    * `extrapolator`: `"warp"` (default), `"repeat"`, `"linear"`, `"exponential"`, `"unet"`, `"unet-paper"`, a
-      path to weights, or any `nl_env.types.DepthExtrapolator`.
+    * `extrapolator`: `"unet"` (default: motion, warp and a network, with shipped weights), `"unet-paper"`,
+      `"warp"`, `"repeat"`, `"linear"`, `"exponential"`, a path to weights, or any
+      `nl_env.types.DepthExtrapolator`.
     * `odometry`: let a named extrapolator use the true camera poses (False).
+    * `runtime`: what runs a network: `"auto"` (CUDA where there is one, else PyTorch), `"torch"`,
+      `"openvino"`, `"onnxruntime"` or `"cuda"`.
     * `obs_mode`, `error`, `error_scale`, `trigger_cost`: see above.
     * `render_mode`: `"rgb_array"`, `"depth_array"`, `"human"` or None.
 
@@ -87,8 +90,9 @@ class DrivingEnv(AdaptiveDepthEnv):
         lidar_hz: int = 10,
         beams: int = 0,
         noise: str = "realistic",
-        extrapolator: str | DepthExtrapolator = "warp",
+        extrapolator: str | DepthExtrapolator = "unet",
         odometry: bool = False,
+        runtime: str = "auto",
         obs_mode: str = "image",
         error: str = "log_mae",
         error_scale: float = 0.05,
@@ -105,6 +109,7 @@ class DrivingEnv(AdaptiveDepthEnv):
             SyntheticStream(config),
             extrapolator=extrapolator,
             odometry=odometry,
+            runtime=runtime,
             obs_mode=obs_mode,
             error=error,
             error_scale=error_scale,

@@ -44,6 +44,8 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         stream: delivers the samples. The environment owns it and closes it.
         extrapolator: a name, a path to weights, or a :class:`nl_env.types.DepthExtrapolator`.
         odometry: give a named extrapolator the true camera poses.
+        runtime: what runs a network: ``"auto"`` (CUDA where there is one, else PyTorch), ``"torch"``,
+            ``"openvino"``, ``"onnxruntime"`` or ``"cuda"``.
         obs_mode: ``"image"``, ``"signed"`` or ``"dict"``.
         error: the metric behind the reward; ``delta_n`` counts as ``1 - delta_n``.
         error_scale: the error that costs a reward of 1.
@@ -64,8 +66,9 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         self,
         stream: SensorStream,
         *,
-        extrapolator: str | DepthExtrapolator = "warp",
+        extrapolator: str | DepthExtrapolator = "unet",
         odometry: bool = False,
+        runtime: str = "auto",
         obs_mode: str = "image",
         error: str = "log_mae",
         error_scale: float = 0.05,
@@ -86,7 +89,7 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         self._trigger_cost = trigger_cost
         self._min_depth = min_depth
         self._stream = stream
-        self._extrapolator = make_extrapolator(extrapolator, odometry=odometry)
+        self._extrapolator = make_extrapolator(extrapolator, odometry=odometry, runtime=runtime)
         self._window = Window(self.metadata["render_fps"])
         self._running = False
         self._started = False

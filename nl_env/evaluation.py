@@ -228,24 +228,27 @@ def summarise(records: Sequence[EpisodeRecord], resamples: NDArray[np.int64]) ->
         triggers_per_s=mean(len(r.triggers) / r.duration_s for r in records),
         held={name: mean(r.held[name] for r in records) for name in METRIC_NAMES},
         produced={name: mean(r.produced[name] for r in records) for name in METRIC_NAMES},
-        precision=_estimate(_precision, counts, resamples),
-        recall=_estimate(_recall, counts, resamples),
-        f1=_estimate(_f1, counts, resamples),
+        precision=estimate(pooled_precision, counts, resamples),
+        recall=estimate(pooled_recall, counts, resamples),
+        f1=estimate(pooled_f1, counts, resamples),
         power_w=mean(r.energy_j / r.duration_s for r in records),
     )
 
 
 def estimate_mean(values: NDArray[np.float64], resamples: NDArray[np.int64]) -> Estimate:
     """Mean of ``values`` ``(sequences,)`` and its interval; nan values are left out."""
-    return _estimate(_nanmean, values[:, None], resamples)
+    return estimate(_nanmean, values[:, None], resamples)
 
 
 Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Reduces ``(..., sequences, columns)`` to ``(...)``."""
 
 
-def _estimate(statistic: Statistic, values: NDArray[np.float64], resamples: NDArray[np.int64]) -> Estimate:
-    """``statistic`` of ``values`` ``(sequences, columns)`` with its percentile-bootstrap interval."""
+def estimate(statistic: Statistic, values: NDArray[np.float64], resamples: NDArray[np.int64]) -> Estimate:
+    """``statistic`` of ``values`` ``(sequences, columns)`` with its percentile-bootstrap interval.
+
+    ``resamples`` are the ``(n, sequences)`` indices of :func:`resample_sequences`.
+    """
     drawn = statistic(values[resamples])
     drawn = drawn[np.isfinite(drawn)]
     if not drawn.size:
@@ -257,24 +260,27 @@ def _estimate(statistic: Statistic, values: NDArray[np.float64], resamples: NDAr
 def _nanmean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean over sequences without the nan ones (a policy that never triggered produced no frame)."""
     finite = np.isfinite(values[..., 0])
-    return _share(np.where(finite, values[..., 0], 0.0).sum(axis=-1), finite.sum(axis=-1))
+    return share(np.where(finite, values[..., 0], 0.0).sum(axis=-1), finite.sum(axis=-1))
 
 
-def _precision(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def pooled_precision(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of triggers that are right, from counts as in :func:`pooled_f1`."""
     hits, false_alarms, _ = np.moveaxis(counts.sum(axis=-2), -1, 0)
-    return _share(hits, hits + false_alarms)
+    return share(hits, hits + false_alarms)
 
 
-def _recall(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def pooled_recall(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Share of keyframes that are triggered, from counts as in :func:`pooled_f1`."""
     hits, _, misses = np.moveaxis(counts.sum(axis=-2), -1, 0)
-    return _share(hits, hits + misses)
+    return share(hits, hits + misses)
 
 
-def _f1(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+def pooled_f1(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """F1 of ``(..., sequences, 3)`` hits, false alarms and misses, counts pooled over sequences."""
     hits, false_alarms, misses = np.moveaxis(counts.sum(axis=-2), -1, 0)
-    return _share(2 * hits, 2 * hits + false_alarms + misses)
+    return share(2 * hits, 2 * hits + false_alarms + misses)
 
 
-def _share(part: NDArray[Any], whole: NDArray[Any]) -> NDArray[np.float64]:
+def share(part: NDArray[Any], whole: NDArray[Any]) -> NDArray[np.float64]:
     """``part / whole``, nan where ``whole`` is 0."""
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=np.asarray(whole) > 0)

@@ -54,7 +54,7 @@ class Settings:
 
     sequences: int = 8
     """Number of test sequences."""
-    duration: float = 20.0
+    duration: float = 12.0
     """Length of each, seconds."""
     seed: int = 0
     """Which test sequences; another seed gives others. Also seeds the bootstrap."""
@@ -64,22 +64,26 @@ class Settings:
     """LiDAR frames per second: 1, 2, 5, 10 or 25."""
     noise: str = "realistic"
     """Event camera: realistic or ideal."""
-    extrapolator: str = "warp"
-    """repeat, linear, exponential, warp, unet, unet-paper, or a path to weights."""
+    extrapolator: str = "unet"
+    """unet (ours), unet-paper, repeat, linear, exponential, warp, or a path to weights."""
     odometry: bool = False
     """Give the extrapolator the true ego motion."""
     policies: tuple[str, ...] = (
+        "keyframe-cnn",
+        "keyframe-cnn-temporal",
+        "evenly:40",
+        "event-rate:0.125",
+        "event-rate-hysteresis",
         "periodic:2",
         "random:0.5",
-        "event-rate",
-        "event-rate-hysteresis",
         "keyframe-rule",
         "greedy",
         "oracle:20",
         "oracle:30",
         "oracle:40",
     )
-    """Rows of the table beside never and always: FAMILY or FAMILY:NUMBER. Families: periodic (every n-th
+    """Rows of the table beside never and always: FAMILY or FAMILY:NUMBER. Families: keyframe-cnn and
+    keyframe-cnn-temporal (probability of a keyframe), evenly (effective rate, Hz), periodic (every n-th
     slice), random (probability), event-rate and event-rate-hysteresis (share of active pixels),
     keyframe-rule, greedy (log_mae of holding), oracle (effective rate, Hz)."""
     sweep: bool = True

@@ -1,7 +1,9 @@
 import json
 
+import numpy as np
 import pytest
 
+from agents import Evenly
 from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
 from scripts import compare
 
@@ -110,3 +112,25 @@ def test_every_family_and_its_sweep_can_be_made(family):
         make_policy(name, seed=0)
     assert parse_policy(family)[0] == family
     make_policy(family, seed=0)
+
+
+@pytest.mark.parametrize("rate", [10, 17.5, 20, 30, 40, 41, 50])
+@pytest.mark.parametrize("period", [5, 10])
+def test_even_triggers_have_their_rate_and_never_meet_a_lidar_frame(rate, period):
+    policy, state, slices = Evenly(rate, period), None, 1000
+    triggers = []
+    for k in range(1, slices + 1):
+        action, state = policy.predict(np.zeros((1, 4, 4), np.uint8), state)
+        if action:
+            triggers.append(k)
+    frames = slices // period + len(triggers)
+    assert frames / (slices * 0.02) == pytest.approx(rate, abs=0.06)
+    assert not [k for k in triggers if k % period == 0]
+    free = [k - k // period for k in triggers]  # counted without the LiDAR's slices
+    assert np.ptp(np.diff(free)) <= 1 if len(free) > 1 else True
+
+
+def test_even_rates_below_the_lidar_or_above_the_slices_are_refused():
+    for rate in (9.9, 50.1):
+        with pytest.raises(ValueError, match=r"rate_hz: found .* expected 10 to 50"):
+            Evenly(rate)

@@ -6,17 +6,25 @@ Importing this module does not import PyTorch; only the networks do, when they a
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.depth import baselines
+from nl_env.depth.exported import load_parts, read_export
+from nl_env.depth.learned import MotionWarpRefine
 from nl_env.depth.metrics import returns_from_depth
-from nl_env.depth.motion import continued, estimate_motion
+from nl_env.depth.motion import IntervalMotion, continued
+from nl_env.depth.runtime import RUNTIMES, NetworkRunner
 from nl_env.depth.warp import warp
 from nl_env.representations import voxel_from_bins
 from nl_env.types import DepthExtrapolator, Extrapolation, ExtrapolationInput
+
+if TYPE_CHECKING:
+    from torch import nn
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 WEIGHT_SUFFIXES = (".safetensors", ".pth", ".pt")
@@ -89,8 +97,7 @@ class Warp:
 
     def reset(self) -> None:
         """Forget the estimated motion."""
-        self._frames: tuple[NDArray[np.float32], ...] = ()
-        self._motion = np.eye(4)
+        self._interval = IntervalMotion()
 
     def __call__(self, inputs: ExtrapolationInput) -> Extrapolation:
         last = inputs.lidar_frames[-1]
@@ -100,54 +107,41 @@ class Warp:
             return Extrapolation(last)
         else:
             period, gap = _period_and_gap(inputs)
-            motion = continued(self._estimated(inputs), gap / period)
+            previous, last = inputs.lidar_frames[-2:]
+            interval = self._interval(previous, last, inputs.camera, inputs.max_depth)
+            motion = continued(interval, gap / period)
         return Extrapolation(warp(last, inputs.camera, motion, inputs.max_depth))
 
-    def _estimated(self, inputs: ExtrapolationInput) -> NDArray[np.float64]:
-        """Motion between the last two LiDAR frames, kept until another frame arrives."""
-        previous, last = inputs.lidar_frames[-2:]
-        if not (self._frames and self._frames[0] is previous and self._frames[1] is last):
-            self._motion = estimate_motion(previous, last, inputs.camera, inputs.max_depth)
-            self._frames = (previous, last)
-        return self._motion
 
-
-class ReleasedUNet:
-    """The paper's network with the weights at ``path`` (a state dict or ``.safetensors``).
+class PaperUNet:
+    """The paper's network, released or a variant: depth now from the last LiDAR frame and the events since.
 
     It has no return head: depths below ``min_return`` metres are read as "no return", and the depth
     as the network gave it is what the paper's metrics see.
 
-    Raises:
-        FileNotFoundError: no file at ``path``.
-        ValueError: the file does not hold the released network's weights.
-        ImportError: PyTorch is not installed (``pip install nl-env[torch]``).
+    Args:
+        network: ``(1, 1, H, W)`` m and ``(1, 5, H, W)`` counts to ``(1, 1, H, W)`` m, in some runtime.
+        min_return: m.
     """
 
     history = 1
     odometry = False
 
-    def __init__(self, path: str | os.PathLike[str], min_return: float = 1.0) -> None:
-        try:
-            from nl_env.depth.unet import load_released
-        except ImportError as cause:
-            raise ImportError("extrapolator: networks need PyTorch, pip install 'nl-env[torch]'") from cause
-
-        self._network = load_released(Path(path))
+    def __init__(
+        self, network: Callable[..., tuple[NDArray[np.float32], ...]], min_return: float = 1.0
+    ) -> None:
+        self._network = network
         self._min_return = min_return
 
     def reset(self) -> None:
         """Nothing to forget."""
 
     def __call__(self, inputs: ExtrapolationInput) -> Extrapolation:
-        import torch
-
         prior = inputs.lidar_frames[-1]
         prior = np.where(prior < inputs.max_depth, prior, np.float32(0))
         voxel = voxel_from_bins(inputs.bins)
-        with torch.inference_mode():
-            predicted = self._network(torch.from_numpy(prior)[None, None], torch.from_numpy(voxel)[None])
-        depth = predicted[0, 0].numpy()
+        (predicted,) = self._network(prior[None, None], voxel[None])
+        depth = predicted[0, 0]
         return Extrapolation(returns_from_depth(depth, self._min_return), depth_if_return=depth)
 
 
@@ -156,20 +150,31 @@ NAMES = ("repeat", "linear", "exponential", "warp", *NETWORKS)
 
 
 def make_extrapolator(
-    spec: str | os.PathLike[str] | DepthExtrapolator, odometry: bool = False
+    spec: str | os.PathLike[str] | DepthExtrapolator,
+    odometry: bool = False,
+    runtime: str = "auto",
+    precision: str | None = None,
 ) -> DepthExtrapolator:
     """The extrapolator behind a name, a path to weights, or an object that is one already.
 
     Args:
-        spec: one of ``NAMES``; a path to the released network's weights (anything with a folder or
-            one of ``WEIGHT_SUFFIXES`` in it); or an object following ``DepthExtrapolator``.
-        odometry: let ``"warp"`` use true poses; the other names have no use for them.
+        spec: one of ``NAMES``; a path (anything with a folder or one of ``WEIGHT_SUFFIXES`` in it) to
+            weights with their card, to the released network's weights without a card, or to a folder that
+            ``scripts/export_onnx.py`` wrote; or an object following ``DepthExtrapolator``.
+        odometry: let ``"warp"`` and ``"unet"`` use true poses; the other names have no use for them.
+        runtime: what runs the networks, one of :data:`nl_env.depth.runtime.RUNTIMES`; for an exported
+            folder ``"auto"`` is ONNX Runtime. Names without a network have no use for it.
+        precision: of the networks, see :func:`nl_env.depth.runtime.compile_network`.
 
     Raises:
-        ValueError: unknown name (the valid ones are listed), or a file of other weights.
+        ValueError: unknown name, runtime or precision (the valid ones are listed), or a file of other
+            weights.
         FileNotFoundError: no such file, or the weights of a named network are not installed.
         TypeError: an object that does not follow ``DepthExtrapolator``.
+        ImportError: a network without its runtime installed.
     """
+    if runtime not in RUNTIMES:
+        raise ValueError(f"runtime: found {runtime!r}, expected one of {', '.join(RUNTIMES)}")
     if not isinstance(spec, (str, os.PathLike)):
         if isinstance(spec, type) or not isinstance(spec, DepthExtrapolator):
             raise TypeError(f"extrapolator: found {spec!r}, expected a name, a path or a DepthExtrapolator")
@@ -187,15 +192,52 @@ def make_extrapolator(
         path = WEIGHTS / f"{name}.safetensors"
         if not path.is_file():
             raise FileNotFoundError(
-                f"extrapolator: {name!r} ({NETWORKS[name]}) needs its weights, nl_env/weights/{path.name}, "
-                f"which are not shipped yet; give a path to weights or one of {', '.join(NAMES[:4])}"
+                f"extrapolator: {name!r} ({NETWORKS[name]}) needs its weights, found no file "
+                f"nl_env/weights/{path.name}; make them with scripts/train_all.py, give a path to weights, "
+                f"or one of {', '.join(NAMES[:4])}"
             )
-        return ReleasedUNet(path)
-    if isinstance(spec, os.PathLike) or Path(name).suffix in WEIGHT_SUFFIXES or os.sep in name:
-        return ReleasedUNet(name)
+        return _from_weights(path, odometry, runtime, precision)
+    path = Path(name)
+    if path.is_dir():
+        return _from_export(path, odometry, runtime, precision)
+    if isinstance(spec, os.PathLike) or path.suffix in WEIGHT_SUFFIXES or os.sep in name:
+        return _from_weights(path, odometry, runtime, precision)
     raise ValueError(
         f"extrapolator: found {name!r}, expected one of {', '.join(NAMES)}, or a path to weights"
     )
+
+
+def _from_weights(path: Path, odometry: bool, runtime: str, precision: str | None) -> DepthExtrapolator:
+    """Ours or the paper's, as the card says; without a card, the released network."""
+    try:
+        from nl_env.depth.networks import UNet, load_networks
+    except ImportError as cause:
+        raise ImportError("extrapolator: networks need PyTorch (pip install torch)") from cause
+
+    network = load_networks(path)
+
+    def running(part: nn.Module) -> NetworkRunner:
+        return NetworkRunner(part, runtime, precision=precision)
+
+    if isinstance(network, UNet):
+        return PaperUNet(running(network))
+    return MotionWarpRefine(
+        None if network.motion is None else running(network.motion),
+        None if network.refine is None else running(network.refine),
+        threshold=network.threshold,
+        warped=network.warped,
+        events=network.events,
+        odometry=odometry,
+    )
+
+
+def _from_export(folder: Path, odometry: bool, runtime: str, precision: str | None) -> DepthExtrapolator:
+    """What an exported folder holds, without PyTorch."""
+    export = read_export(folder)
+    parts = load_parts(folder, export, runtime, precision)
+    if "network" in parts:
+        return PaperUNet(parts["network"])
+    return MotionWarpRefine(parts.get("motion"), parts.get("refine"), odometry=odometry, **export.options)
 
 
 def _period_and_gap(inputs: ExtrapolationInput) -> tuple[float, float]:

@@ -39,6 +39,11 @@ STARTS = (0.0, 1.0, 2.0, 3.0)
 """Metres forward from the guess that the coarsest level is tried from; the best one is refined.
 Small motions are found from any of them, fast driving (30 m/s at 10 Hz) needs the far ones."""
 
+AHEAD_STEP, AHEAD_MOST = 0.25, 3.25
+"""Metres forward from the guess that are compared once more at the finest level. Blurred by the coarser
+ones, a road between rows of distant trees looks best when nothing moves at all: fast drives would be
+taken for standing still."""
+
 _SKY = 0.005
 """Inverse depth (1/m) added to the scale of relative residuals: below it, differences count less."""
 
@@ -104,10 +109,31 @@ def estimate_motion(
     ]
     *finer, coarsest = levels
     trials = [_align(*coarsest, _ahead(start, metres), ITERATIONS, CONVERGED, _DAMPING) for metres in STARTS]
-    _, motion = min(trials, key=lambda trial: trial[0])
+    cost, motion = min(trials, key=lambda trial: trial[0])
     for level in reversed(finer):
-        _, motion = _align(*level, motion, ITERATIONS, CONVERGED, _DAMPING)
-    return motion
+        cost, motion = _align(*level, motion, ITERATIONS, CONVERGED, _DAMPING)
+    finest = levels[0]
+    ahead = np.arange(0.0, AHEAD_MOST + AHEAD_STEP / 2, AHEAD_STEP)
+    other = _best_ahead(*finest, motion, start[2, 3] - ahead)
+    other_cost, other = _align(*finest, other, ITERATIONS, CONVERGED, _DAMPING)
+    return other if other_cost < cost else motion
+
+
+class IntervalMotion:
+    """:func:`estimate_motion` between two LiDAR frames, kept until other frames come."""
+
+    def __init__(self) -> None:
+        self._frames: tuple[NDArray[np.float32], ...] = ()
+        self._motion = np.eye(4)
+
+    def __call__(
+        self, previous: NDArray[np.float32], last: NDArray[np.float32], camera: Camera, max_depth: float
+    ) -> NDArray[np.float64]:
+        """Motion ``(4, 4)`` from ``previous`` to ``last``, which are told apart by identity."""
+        if not (self._frames and self._frames[0] is previous and self._frames[1] is last):
+            self._motion = estimate_motion(previous, last, camera, max_depth)
+            self._frames = (previous, last)
+        return self._motion
 
 
 def _ahead(motion: NDArray[np.float64], metres: float) -> NDArray[np.float64]:
@@ -175,6 +201,19 @@ def _align(source, target, intrinsics, scale, stride, motion, iterations, conver
             break
         motion = _stepped(motion, step)
     return best_cost, best
+
+
+@njit(cache=True, error_model="numpy")
+def _best_ahead(source, target, intrinsics, scale, stride, motion, places):  # type: ignore[no-untyped-def]
+    """``motion`` with that of ``places`` (m along the optical axis) that costs least."""
+    best_cost, best = np.inf, motion
+    for place in places:
+        trial = motion.copy()
+        trial[2, 3] = place
+        cost = _normal_equations(source, target, intrinsics, scale, stride, trial)[0]
+        if cost < best_cost:
+            best_cost, best = cost, trial
+    return best
 
 
 @njit(cache=True, error_model="numpy")

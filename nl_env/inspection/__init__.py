@@ -1,0 +1,83 @@
+"""What is in a file or folder: recordings, ELiDAR's files, or weights, and what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from nl_env.elidar import find_files
+from nl_env.elidar.layout import HDF5_SUFFIXES, hdf5_kind
+from nl_env.inspection.elidar import (
+    inspect_elidar,
+    inspect_lists,
+    inspect_metadata,
+    inspect_raw,
+    inspect_slicing,
+)
+from nl_env.inspection.findings import Findings, Reading
+from nl_env.inspection.native import inspect_recordings, inspect_weights
+
+__all__ = ["Findings", "Reading", "inspect_path"]
+
+WEIGHT_SUFFIXES = (".safetensors", ".pth", ".pt")
+
+
+def inspect_path(path: Path, reading: Reading) -> list[Findings]:
+    """Everything found at ``path``, a file or folder of any of these kinds.
+
+    Raises:
+        FileNotFoundError: nothing there, or a folder with nothing known in it.
+        ValueError: a file that is none of the known kinds, or that cannot be read.
+    """
+    if path.is_dir():
+        return list(_folder(path, reading))
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.suffix in WEIGHT_SUFFIXES:
+        return [inspect_weights(path)]
+    if path.suffix == ".npz":
+        return [inspect_raw({path.stem: path}, path, reading)]
+    if path.suffix == ".csv":
+        return [inspect_metadata(path)]
+    if path.suffix == ".txt":
+        return [inspect_lists({"sequences": path}, path)]
+    if path.suffix in HDF5_SUFFIXES:
+        return list(_hdf5(path, reading))
+    known = ", ".join((*HDF5_SUFFIXES, ".npz", ".csv", ".txt", *WEIGHT_SUFFIXES))
+    raise ValueError(f"{path}: found {path.suffix or 'no suffix'}, expected a folder or one of {known}")
+
+
+def _hdf5(path: Path, reading: Reading) -> Iterator[Findings]:
+    kind = hdf5_kind(path)
+    if kind == "recording":
+        yield inspect_recordings([path], path, reading)
+    elif kind == "slicing":
+        yield inspect_slicing(path, reading)
+    elif kind == "pairs":
+        yield from inspect_elidar(find_files(path.parent), reading)
+    else:
+        raise ValueError(f"{path}: found an HDF5 file that is neither a recording nor one of ELiDAR's")
+
+
+def _folder(folder: Path, reading: Reading) -> Iterator[Findings]:
+    """Recordings and weights wherever they are; ELiDAR's files where there is neither."""
+    recordings, weights, unreadable = [], [], []
+    for path in sorted(folder.rglob("*")):
+        if path.name.startswith(".") or not path.is_file():
+            continue
+        if path.suffix in WEIGHT_SUFFIXES:
+            weights.append(path)
+        elif path.suffix in HDF5_SUFFIXES:
+            try:
+                if hdf5_kind(path) == "recording":
+                    recordings.append(path)
+            except ValueError as error:
+                unreadable.append(str(error))
+    if recordings:
+        found = inspect_recordings(recordings, folder, reading)
+        found.problems += unreadable
+        yield found
+    for path in weights:
+        yield inspect_weights(path)
+    if not recordings and not weights:
+        yield from inspect_elidar(find_files(folder), reading)
