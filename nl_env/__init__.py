@@ -7,7 +7,10 @@ from gymnasium.envs.registration import register, registry
 
 __version__ = "0.1.0"
 
-ENTRY_POINTS = {"nl_env/Driving-v0": "nl_env.driving:DrivingEnv"}
+ENTRY_POINTS = {
+    "nl_env/Driving-v0": "nl_env.driving:DrivingEnv",
+    "nl_env/Replay-v0": "nl_env.replay:ReplayEnv",
+}
 
 
 def register_envs() -> None:

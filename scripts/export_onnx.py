@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -91,7 +91,7 @@ def witnesses(network: nn.Module, shown: ExtrapolationInput) -> dict[str, Witnes
     return parts
 
 
-def options(network: nn.Module) -> dict[str, object]:
+def options(network: nn.Module) -> dict[str, Any]:
     """What :class:`MotionWarpRefine` has to know besides the networks; nothing for the paper's."""
     names = () if isinstance(network, UNet) else ("threshold", "warped", "events")
     return {name: getattr(network, name) for name in names}

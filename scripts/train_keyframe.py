@@ -43,7 +43,7 @@ from nl_env.training import Task, TrainingOptions, seeded, train
 from nl_env.training.run import BEST
 from nl_env.weight_files import Card, load_network, load_strictly, read_tensors, write_card, write_weights
 
-MEMORY_SAMPLING = SampleOptions(window=250, stride=25, new_weight=4.0)
+MEMORY_SAMPLING = SampleOptions(window=250, stride=25, new_weight=1.0)
 MEMORY_TRAINING = TrainingOptions(
     steps=300,
     batch_size=16,
@@ -117,14 +117,14 @@ RECIPES: dict[str, tuple[str, Options]] = {
             network={},
             sampling=SampleOptions(),
             training=TrainingOptions(
-                steps=6000,
+                steps=3000,
                 batch_size=64,
                 learning_rate=3e-3,
                 weight_decay=0.02,
                 warmup_steps=100,
                 clip_gradient=1.0,
                 ema=0.995,
-                evaluate_every=500,
+                evaluate_every=300,
                 threads=1,
             ),
             out=Path("runs/keyframe-cnn-temporal"),

@@ -129,7 +129,7 @@ def compile_network(
         from nl_env.depth.runtime.onnx_export import export_onnx
 
         names = [f"input_{k}" for k in range(len(examples))]
-        model = export_onnx(network, examples, names, for_bf16=precision == "bf16")
+        model = export_onnx(network, examples, names)
         if runtime == "openvino":
             run = OpenVinoNetwork(model, threads, precision == "bf16", names)
         else:

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, fx, nn
 
-from nl_env.depth.runtime.bfloat16 import round_kernels
 from nl_env.depth.runtime.tracing import traced
 
 OPSET = 17
@@ -24,7 +23,6 @@ def export_onnx(
     output_names: Sequence[str] | None = None,
     *,
     half: bool = False,
-    for_bf16: bool = False,
 ) -> bytes:
     """The network with its batch norms folded as an ONNX model of fixed shapes.
 
@@ -32,8 +30,6 @@ def export_onnx(
         network, example_inputs: as in :func:`nl_env.depth.runtime.compile_network`.
         input_names, output_names: default ``input_0``, ... and ``output_0``, ...
         half: weights and arithmetic in float16; inputs and outputs stay float32.
-        for_bf16: prepare the weights for a runtime that rounds them to bfloat16
-            (:mod:`nl_env.depth.runtime.bfloat16`).
 
     Raises:
         ImportError: the ``onnx`` package is not installed.
@@ -45,8 +41,6 @@ def export_onnx(
         raise ImportError("exporting to ONNX needs 'onnx', pip install 'nl-env[onnx]'") from cause
     inputs = tuple(torch.from_numpy(np.array(example, order="C")) for example in example_inputs)
     module, outputs = traced(network, inputs)
-    if for_bf16:
-        round_kernels(module)
     exported: nn.Module = _HalfInside(module) if half else module
     file = io.BytesIO()
     with torch.no_grad(), warnings.catch_warnings():

@@ -22,8 +22,6 @@ from nl_env.depth.runtime.tracing import add_constant, constant, options, tidy, 
 
 _RELUS = (functional.relu, torch.relu, "relu")
 _SUMS = (operator.add, torch.add, "add")
-_FRESH = (torch.conv2d, torch.conv_transpose2d, torch.ops.mkldnn._convolution_pointwise.default)
-"""Operations whose results are memory of their own."""
 
 
 class TorchNetwork:
@@ -110,7 +108,7 @@ def _fuse_sum(graph: fx.Graph, conv: fx.Node, total: fx.Node, call: list[Any]) -
     relu = follower is not None and follower.target in _RELUS
     replaced = [follower, total, conv] if follower is not None and relu else [total, conv]
     how: tuple[Any, ...] = ("add", 1.0, "relu" if relu else None, [], "")
-    if _only_reader(other) is total and other.target in _FRESH:
+    if _only_reader(other) is total and _is_fresh(other):
         _replace(graph, replaced, torch.ops.mkldnn._convolution_pointwise_.binary, (other, *call, *how))
     else:
         source, *rest = call
@@ -141,6 +139,12 @@ def _sums_same_shapes(node: fx.Node) -> bool:
             for summand in summands
         )
     )
+
+
+def _is_fresh(node: fx.Node) -> bool:
+    """Whether the node's result is memory of its own."""
+    fused = torch.ops.mkldnn._convolution_pointwise.default
+    return node.target in (torch.conv2d, torch.conv_transpose2d, fused)
 
 
 def _only_reader(node: fx.Node) -> fx.Node | None:
