@@ -434,10 +434,15 @@ class TestWriting:
             return write(self, data)
 
         monkeypatch.setattr(_Output, "write", pressing)
-        with pytest.raises(KeyboardInterrupt):
-            record_sequence(tmp_path / "1.h5", CONFIG, SEED)
-        assert list(tmp_path.iterdir()) == []
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        # Where a shell began the tests with &, Ctrl-C is ignored.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                record_sequence(tmp_path / "1.h5", CONFIG, SEED)
+            assert list(tmp_path.iterdir()) == []
+            assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def test_a_full_disk_keeps_the_previous_file_and_is_named(self, tmp_path):
         (tmp_path / "1.h5").write_bytes(b"before")

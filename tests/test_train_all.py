@@ -61,7 +61,7 @@ def test_every_planned_command_is_understood_by_its_script(tmp_path, monkeypatch
 
     def work(*arguments):
         done.append(arguments)
-        return SimpleNamespace(metrics={"thresholds": {}})
+        return SimpleNamespace(metrics={"at_thresholds": {}})
 
     monkeypatch.setattr(record, "run", work)
     monkeypatch.setattr(train_keyframe, "run", work)
