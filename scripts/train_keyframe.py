@@ -74,9 +74,9 @@ class Options:
     """Which windows of slices its second half learns from."""
     memory_training: TrainingOptions = MEMORY_TRAINING
     """How its second half learns to remember."""
-    recordings: Path = Path("runs/recordings-train")
+    recordings: Path = Path("runs/data/train")
     """Recordings to learn from."""
-    validation: Path = Path("runs/recordings-val")
+    validation: Path = Path("runs/data/val")
     """Recordings that choose the best weights and the thresholds."""
     workers: int = 1
     """Processes that cut slices out of the recordings, once."""

@@ -298,8 +298,10 @@ class TestDamage:
             recording.verify()
 
     def test_an_undamaged_file_verifies(self, short, path):
-        self.read_all(short)
-        self.read_all(path)
+        for file in (short, path):
+            with Recording(file) as recording:
+                recording.verify()
+                assert len(recording.events(0, 20_000)) == recording.event_count(1) > 0
 
     @pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.999])
     def test_truncated(self, damaged, share):
