@@ -33,6 +33,7 @@ bench: .venv/.dev
 	$(BIN)/python benchmarks/extrapolators.py --markdown docs/extrapolators.md > docs/extrapolators.json
 	$(BIN)/python benchmarks/inference.py --markdown docs/runtimes.md > docs/runtimes.json
 	$(BIN)/python benchmarks/training.py --markdown docs/training.md > docs/training.json
+	$(BIN)/python benchmarks/replay.py --markdown docs/data.md > docs/replay.json
 
 realism: .venv/.report
 	@$(COMPILING)

@@ -26,9 +26,13 @@ class Policy(ABC):
 
     Attributes:
         privileged: True if the policy looks at more than the observation.
+        obs_mode: the environment's mode that evaluation shows it; :meth:`read` may accept others.
+        trigger_cost: what to tell policies that want to know what a trigger costs; None for the others.
     """
 
     privileged = False
+    obs_mode = "image"
+    trigger_cost: float | None = None
 
     def predict(
         self,
@@ -40,7 +44,7 @@ class Policy(ABC):
         """Stable-Baselines3's signature.
 
         Args:
-            observation: of any ``obs_mode``, single or a batch of n.
+            observation: single or a batch of n, of a mode that :meth:`read` accepts.
             state: the second return value of the previous call; None starts anew.
             episode_start: ``(n,)`` bool, True where an environment has just been reset.
             deterministic: no effect; the policies here have no second, noisier behaviour.
@@ -48,25 +52,30 @@ class Policy(ABC):
         Returns:
             ``(action, state)``: an ``np.int64`` for a single observation, ``(n,)`` int64 for a batch.
         """
-        frames = event_frames(observation)
-        batched = frames.ndim == 3
-        if not batched:
-            frames = frames[None]
-        count = len(frames)
+        seen, batched = self.read(observation)
+        count = len(seen)
         memory = self.initial_memory(count) if state is None else state.copy()
         if episode_start is not None:
             started = np.broadcast_to(np.asarray(episode_start, dtype=bool), count)
             memory[started] = self.initial_memory(count)[started]
-        actions = self.decide(frames, memory)
+        actions = self.decide(seen, memory)
         return (actions if batched else actions[0]), memory
+
+    def read(self, observation: Any) -> tuple[NDArray[Any], bool]:
+        """What :meth:`decide` sees, ``(n, ...)``, and whether the observation was a batch.
+
+        Event frames ``(n, H, W)`` int16 here, from every mode that holds them.
+        """
+        frames = event_frames(observation)
+        return (frames, True) if frames.ndim == 3 else (frames[None], False)
 
     def initial_memory(self, count: int) -> Memory:
         """``(count, ...)`` memory at the start of an episode, of any dtype; by default nothing."""
         return np.zeros((count, 0), dtype=np.int64)
 
     @abstractmethod
-    def decide(self, frames: NDArray[np.int16], memory: Memory) -> Actions:
-        """Actions ``(n,)`` for event frames ``(n, H, W)``; updates ``memory`` in place."""
+    def decide(self, seen: NDArray[Any], memory: Memory) -> Actions:
+        """Actions ``(n,)`` for what :meth:`read` gives; updates ``memory`` in place."""
 
 
 class Trace(Protocol):
@@ -75,6 +84,7 @@ class Trace(Protocol):
     Attributes:
         keyframe: ``(K+1,)`` bool, the keyframe label of every slice, t = 0 first.
         lidar: ``(K+1,)`` bool, slices with a LiDAR frame.
+        ego_speed: ``(K+1,)`` m/s.
         errors: for each metric ``(K+1, P)`` float64: the error at slice k of the depth frame produced
             at slice k - a of the same LiDAR interval, NaN where there is none.
     """
@@ -83,6 +93,8 @@ class Trace(Protocol):
     def keyframe(self) -> NDArray[np.bool_]: ...
     @property
     def lidar(self) -> NDArray[np.bool_]: ...
+    @property
+    def ego_speed(self) -> NDArray[np.float64]: ...
     @property
     def errors(self) -> Any: ...
 
@@ -96,6 +108,10 @@ class Truth(Protocol):
 
     def lidar(self, index: int) -> bool:
         """Whether a LiDAR frame arrives at slice ``index``."""
+        ...
+
+    def ego_speed(self, index: int) -> float:
+        """Speed of the vehicle at slice ``index``, m/s."""
         ...
 
     def holding_error(self, index: int, age: int) -> float:
@@ -117,6 +133,9 @@ class LiveTruth:
     def lidar(self, index: int) -> bool:
         return self._env.sample.lidar is not None
 
+    def ego_speed(self, index: int) -> float:
+        return float(self._env.sample.state.speed)
+
     def holding_error(self, index: int, age: int) -> float:
         return full_metrics(self._env.depth, self._env.sample.depth, self._env.stream.max_depth).log_mae
 
@@ -132,6 +151,9 @@ class TraceTruth:
 
     def lidar(self, index: int) -> bool:
         return bool(self._trace.lidar[index])
+
+    def ego_speed(self, index: int) -> float:
+        return float(self._trace.ego_speed[index])
 
     def holding_error(self, index: int, age: int) -> float:
         return float(self._trace.errors["log_mae"][index, age])

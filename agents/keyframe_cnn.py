@@ -28,8 +28,8 @@ TEMPORAL_WEIGHTS = WEIGHTS / "keyframe-cnn-temporal.safetensors"
 RELEASED_SIZE = (480, 640)
 ANSWERS = 4096
 """Answers kept for every network: four sequences of 20 s, 2 MB."""
-BLOCK = 256
-"""Slices that pass through the network together when a whole sequence is scored."""
+BLOCK_PIXELS = 256 * 120 * 160
+"""Of the slices that pass through the network together when a whole sequence is scored."""
 
 
 @dataclass(frozen=True)
@@ -169,20 +169,26 @@ class KeyframeCNN(Policy):
             logits, after = self.network.step(pooled, torch.from_numpy(memory.copy()))
         return logits.numpy(), after.numpy()
 
-    def score_sequence(self, frames: NDArray[Any]) -> NDArray[np.float32]:
+    def score_sequence(self, frames: Any) -> NDArray[np.float32]:
         """``(K,)`` probabilities of "keyframe" for the event frames ``(K, H, W)`` of slices 1..K.
 
         The same numbers as from one prediction after the other, up to rounding, in less time. Any integer
-        dtype will do.
+        dtype will do, and so does anything with a length whose slices are such arrays: it is read in blocks.
         """
         memory = torch.zeros(1, self.network.memory_size)
         scores = []
+        length = block_length(self.network.size)
         with limited_threads(self.threads), torch.inference_mode():
-            for start in range(0, len(frames), BLOCK):
-                pooled = average_down(frames[start : start + BLOCK], self.network.size)
+            for start in range(0, len(frames), length):
+                pooled = average_down(frames[start : start + length], self.network.size)
                 logits, memory = self.network.follow(torch.from_numpy(pooled)[None], memory)
                 scores.append(probability(logits[0, :, 0].numpy()))
         return np.concatenate(scores) if scores else np.zeros(0, np.float32)
+
+
+def block_length(size: tuple[int, int]) -> int:
+    """Slices of ``size`` (H, W) that pass through a network together; bounds its memory."""
+    return max(1, BLOCK_PIXELS // (size[0] * size[1]))
 
 
 def probability(logits: NDArray[np.float32]) -> NDArray[np.float32]:

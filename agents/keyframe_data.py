@@ -6,12 +6,10 @@ run of slices through a memory map.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +18,10 @@ from agents.actor_maps import actor_maps, grid
 from agents.keyframe_networks import CAUSES, MOTIONS, RANGES
 from nl_env.config import DrivingConfig, from_dict
 from nl_env.recording import Recording
+from nl_env.recording.cut_set import CutSet, cut
+from nl_env.recording.manifest import read_manifest
 from nl_env.representations import event_frame
-from nl_env.runs import SETTINGS_FILE, open_folder, run_sequences
 from nl_env.types import SLICE_US
-
-MANIFEST = "manifest.json"
-"""Beside the recordings: what there is, written when all of it is finished."""
 
 COUNT_LIMIT = 127
 """Frames are stored as int8, and the environment's image cuts them at the same place. No pixel of the
@@ -77,128 +73,115 @@ def build_slices(
     Args:
         recordings: output of ``scripts/record.py``.
         folder: where the slices go. One that holds these slices already is only opened.
-        workers: processes of one thread each; the files do not depend on it.
-        progress: called with the number of newly finished sequences.
+        workers, progress: as :func:`nl_env.recording.cut_set.cut`.
 
     Raises:
         FileNotFoundError: no manifest: nothing recorded there, or not finished.
         ValueError: ``folder`` holds slices of other recordings, or a recording is damaged.
         OSError: ``folder`` cannot be written.
     """
-    path = recordings / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"recordings: found no {MANIFEST} in {str(recordings)!r}; record.py writes it"
-        )
-    text = path.read_bytes()
-    manifest = json.loads(text)
-    seeds = [int(seed) for seed in manifest["seeds"]]
-    entries = {int(entry["seed"]): entry for entry in manifest["sequences"]}
+    manifest = read_manifest(recordings)
     identity = {
-        "manifest_sha256": hashlib.sha256(text).hexdigest(),
-        "split": manifest["split"],
-        "seeds": seeds,
-        "weathers": [entries[seed]["description"]["weather"] for seed in seeds],
-        "config": manifest["config"],
+        "manifest_sha256": manifest.sha256,
+        "split": manifest.split,
+        "seeds": list(manifest.entries),
+        "weathers": [entry["description"]["weather"] for entry in manifest.entries.values()],
+        "config": manifest.content["config"],
     }
-    files = {seed: recordings / entry["file"] for seed, entry in entries.items()}
-    checkpoints = open_folder(folder, identity, resume=True)
-    run_sequences(
-        _CutSequence(files),
-        _Cut.load,
-        seeds,
-        checkpoints,
-        workers=workers,
-        suffix=".npy",
-        progress=progress,
-    )
+    cut(folder, identity, _CutSlices(manifest.files), workers=workers, progress=progress)
     return Slices(folder)
 
 
-class Slices:
-    """The slices that :func:`build_slices` cut: sequences of equal length, read from disk as needed.
+class FrameSource(Protocol):
+    """Sequences of labelled event frames, as the training of detectors takes them; ``len`` counts sequences.
 
-    Files are mapped at the first access, once per process; pickling carries the path alone.
-
-    Args:
-        folder: as given to :func:`build_slices`.
-
-    Raises:
-        FileNotFoundError: ``folder`` holds no slices.
-        ValueError: a file that is truncated or holds something else (at its first access).
+    Attributes:
+        shape: ``(H, W)``.
+        length: slices of every sequence.
+        seeds, weathers: of the sequences.
     """
 
+    shape: tuple[int, int]
+    length: int
+    seeds: list[int]
+    weathers: list[str]
+
+    def __len__(self) -> int: ...
+
+    def frames(self, number: int) -> Any:
+        """Event frames of a sequence: a slice of it is ``(n, H, W)`` int8, and it has a length."""
+        ...
+
+    def causes(self, number: int) -> NDArray[np.bool_]:
+        """``(length, 3)`` bool, the causes of every slice, or ``(length, 1)``, the label alone."""
+        ...
+
+    def lidar(self, number: int) -> NDArray[np.bool_]:
+        """``(length,)`` bool, slices with a LiDAR frame."""
+        ...
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Where they are from, for cards: JSON-ready."""
+        ...
+
+
+class Slices(CutSet):
+    """The slices that :func:`build_slices` cut: sequences of equal length, read from disk as needed.
+
+    A :class:`FrameSource`; ``sequence`` gives ``(length,)`` rows of :func:`slice_dtype`.
+    Errors as :class:`nl_env.recording.cut_set.CutSet`.
+    """
+
+    what = "slices"
+
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        marker = self.folder / SETTINGS_FILE
-        if not marker.is_file():
-            raise FileNotFoundError(f"slices: found no {SETTINGS_FILE} in {str(self.folder)!r}")
-        self.identity: dict[str, Any] = json.loads(marker.read_text(encoding="utf-8"))
+        super().__init__(folder)
         config = from_dict(DrivingConfig, self.identity["config"])
         self.shape = config.camera.shape
         self.length = config.scene.slices
-        self.seeds: list[int] = self.identity["seeds"]
         self.weathers: list[str] = self.identity["weathers"]
-        self._sequences: dict[int, NDArray[np.void]] = {}
 
     def __len__(self) -> int:
         """Number of sequences."""
         return len(self.seeds)
 
-    def sequence(self, number: int) -> NDArray[np.void]:
-        """``(length,)`` rows of :func:`slice_dtype`, mapped from the file."""
-        if number not in self._sequences:
-            path = self.folder / "sequences" / f"{self.seeds[number]}.npy"
-            found = _Cut.load(path).rows
-            expected = slice_dtype(self.shape)
-            if found.dtype != expected or found.shape != (self.length,):
-                raise ValueError(
-                    f"slices: found {found.shape} of other contents in {str(path)!r}, "
-                    f"expected {(self.length,)} slices of {self.shape}"
-                )
-            self._sequences[number] = found
-        return self._sequences[number]
+    def expected(self, number: int) -> tuple[np.dtype[Any], tuple[int, ...]]:
+        """Sequences of one length."""
+        return slice_dtype(self.shape), (self.length,)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """As :class:`FrameSource`."""
+        return {
+            "split": self.identity["split"],
+            "sequences": len(self),
+            "slices": self.length,
+            "first_seed": self.seeds[0],
+            "manifest_sha256": self.identity["manifest_sha256"],
+        }
+
+    def frames(self, number: int) -> NDArray[np.int8]:
+        """``(length, H, W)``, mapped from the file."""
+        return np.asarray(self.sequence(number)["frame"])
+
+    def lidar(self, number: int) -> NDArray[np.bool_]:
+        """As :class:`FrameSource`."""
+        return np.array(self.sequence(number)["lidar"])
 
     def causes(self, number: int) -> NDArray[np.bool_]:
         """``(length, 3)`` bool, the causes of every slice: speed, distance, new."""
         rows = self.sequence(number)
         return np.stack([rows["speed"], rows["distance"], rows["new"]], axis=1)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"folder": self.folder}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["folder"])  # type: ignore[misc]
-
 
 @dataclass(frozen=True)
-class _Cut:
-    """The slices of one sequence and their file."""
-
-    rows: NDArray[np.void]
-
-    def save(self, path: Path) -> None:
-        """Write uncompressed."""
-        np.save(path, self.rows, allow_pickle=False)
-
-    @classmethod
-    def load(cls, path: Path) -> _Cut:
-        """Map what :meth:`save` wrote."""
-        try:
-            return cls(np.load(path, mmap_mode="r", allow_pickle=False))
-        except FileNotFoundError:
-            raise
-        except (ValueError, EOFError, OSError) as cause:
-            raise ValueError(f"slices: found no whole array in {str(path)!r} ({cause})") from cause
-
-
-@dataclass(frozen=True)
-class _CutSequence:
+class _CutSlices:
     """The work of one process."""
 
-    files: dict[int, Path]
+    files: Mapping[int, Path]
 
-    def __call__(self, seed: int) -> _Cut:
+    def __call__(self, seed: int) -> NDArray[np.void]:
         """Cut the sequence of ``seed``."""
         with Recording(self.files[seed]) as recording:
-            return _Cut(cut_slices(recording))
+            return cut_slices(recording)

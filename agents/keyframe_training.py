@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from agents.keyframe_cnn import BLOCK, KeyframeCNN, probability
-from agents.keyframe_data import Slices
+from agents.keyframe_cnn import KeyframeCNN, average_down, block_length, probability
+from agents.keyframe_data import FrameSource, Slices
 from agents.keyframe_networks import Detector, TemporalDetector
 from nl_env.classification import Detection, auroc, best_f1_threshold, matching_threshold, rate_threshold
 from nl_env.config import number
@@ -67,12 +67,13 @@ class KeyframeTask:
         options: how samples are drawn.
 
     Attributes:
-        labels: ``(sequences, K, 4)`` uint8, label and causes of all training slices.
+        labels: ``(sequences, K, 4)`` uint8, label and causes of all training slices, or ``(sequences, K, 1)``
+            where causes are not known.
     """
 
     criterion = "ranking_error"
 
-    def __init__(self, training: Slices, validation: Slices, options: SampleOptions) -> None:
+    def __init__(self, training: FrameSource, validation: FrameSource, options: SampleOptions) -> None:
         if training.shape != validation.shape:
             raise ValueError(f"validation: found frames {validation.shape}, expected {training.shape}")
         if training.length < options.window:
@@ -92,12 +93,11 @@ class KeyframeTask:
         return len(self.training) * self._per_sequence
 
     def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Sequence[NDArray[Any]]:
-        """Frames ``(N, T, H, W)`` int8 and ``(N, T, 4)`` uint8: the label and its causes."""
+        """Frames ``(N, T, H, W)`` int8 and ``(N, T, 4)`` uint8, label and causes, or ``(N, T, 1)``."""
         frames, labels = [], []
         for index in indices:
             sequence, window = self.window(int(index), rng)
-            rows = self.training.sequence(sequence)[window]
-            frames.append(augment(rows["frame"], rng, self.options))
+            frames.append(augment(self.training.frames(sequence)[window], rng, self.options))
             labels.append(self.labels[sequence, window])
         return np.stack(frames), np.stack(labels)
 
@@ -201,7 +201,11 @@ class RecallTask:
     criterion = KeyframeTask.criterion
 
     def __init__(
-        self, network: TemporalDetector, training: Slices, validation: Slices, options: SampleOptions
+        self,
+        network: TemporalDetector,
+        training: FrameSource,
+        validation: FrameSource,
+        options: SampleOptions,
     ) -> None:
         self.options = options
         self._windows = KeyframeTask(training, validation, options)
@@ -236,9 +240,10 @@ class RecallTask:
 
 def cross_entropy(logits: Tensor, labels: Tensor, options: SampleOptions) -> tuple[Tensor, dict[str, Tensor]]:
     """Binary cross entropy of the label, and of the causes where the logits ``(N, T, 1 or 4)`` name them."""
-    weights = 1 + (options.new_weight - 1) * labels[..., -1]
+    known = labels.shape[-1] > 1
+    weights = 1 + (options.new_weight - 1) * labels[..., -1] if known else None
     label = functional.binary_cross_entropy_with_logits(logits[..., 0], labels[..., 0], weights)
-    if logits.shape[-1] == 1 or not options.cause_weight:
+    if logits.shape[-1] == 1 or not known or not options.cause_weight:
         return label, {}
     causes = functional.binary_cross_entropy_with_logits(logits[..., 1:], labels[..., 1:])
     return label + options.cause_weight * causes, {"label": label, "causes": causes}
@@ -253,22 +258,29 @@ def judged(scores: NDArray[np.floating], truth: NDArray[np.bool_]) -> dict[str, 
     }
 
 
-def labels_of(data: Slices, number: int) -> NDArray[np.uint8]:
-    """``(K, 4)``: the label and its causes, for every slice of a sequence."""
+def labels_of(data: FrameSource, number: int) -> NDArray[np.uint8]:
+    """``(K, 4)``: the label and its causes, for every slice of a sequence; ``(K, 1)`` without causes."""
     causes = data.causes(number)
+    if causes.shape[1] == 1:
+        return causes.astype(np.uint8)
     return np.concatenate([causes.any(axis=1, keepdims=True), causes], axis=1).astype(np.uint8)
 
 
-def look(network: TemporalDetector, data: Slices, mirrored: bool = False) -> NDArray[np.float32]:
-    """What the network's first half sees, ``(sequences, K, S)``; in evaluation mode, on its device."""
+def look(network: TemporalDetector, data: FrameSource, mirrored: bool = False) -> NDArray[np.float32]:
+    """What the network's first half sees, ``(sequences, K, S)``; in evaluation mode, on its device.
+
+    Frames of another size are averaged down to the network's.
+    """
     device = next(network.parameters()).device
     network.eval()
     seen = []
     with torch.inference_mode():
         for number in range(len(data)):
-            frames = data.sequence(number)["frame"][..., :: -1 if mirrored else 1]
-            for start in range(0, len(frames), BLOCK):
-                block = np.ascontiguousarray(frames[start : start + BLOCK], dtype=np.float32)
+            frames = data.frames(number)
+            length = block_length(data.shape)
+            for start in range(0, len(frames), length):
+                block = average_down(frames[start : start + length], network.size)
+                block = np.ascontiguousarray(block[..., :: -1 if mirrored else 1])
                 perceived = network.perceive(torch.from_numpy(block).to(device))
                 seen.append(network.summarise(*perceived).cpu().numpy())
     return np.concatenate(seen).reshape(len(data), data.length, -1)
@@ -290,14 +302,13 @@ def augment(frames: NDArray[np.int8], rng: np.random.Generator, options: SampleO
     return frames
 
 
-def detect(network: Detector, data: Slices, threads: int | None = None) -> list[Detection]:
+def detect(network: Detector, data: FrameSource, threads: int | None = None) -> list[Detection]:
     """The detector's probabilities on every sequence; ``threads`` as PyTorch has them by default."""
     policy = KeyframeCNN(network, threads=threads or torch.get_num_threads())
     found = []
     for sequence, (seed, weather) in enumerate(zip(data.seeds, data.weathers, strict=True)):
-        rows = data.sequence(sequence)
-        scores = policy.score_sequence(rows["frame"])
-        found.append(Detection(seed, weather, scores, data.causes(sequence), np.array(rows["lidar"])))
+        scores = policy.score_sequence(data.frames(sequence))
+        found.append(Detection(seed, weather, scores, data.causes(sequence), data.lidar(sequence)))
     return found
 
 

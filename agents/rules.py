@@ -76,6 +76,28 @@ class Evenly(Policy):
         return ((offset > 0) & (due > before)).astype(np.int64)
 
 
+class FixedSchedule(Policy):
+    """Trigger at the same slices of every LiDAR interval.
+
+    Args:
+        pattern: one digit for each slice between two LiDAR frames, 1 where it triggers; ``"0100"`` is one
+            trigger, 40 ms after each LiDAR frame.
+    """
+
+    def __init__(self, pattern: str) -> None:
+        if not pattern or set(pattern) - {"0", "1"}:
+            raise ValueError(f"pattern: found {pattern!r}, expected digits 0 and 1, one for each slice")
+        self.pattern = pattern
+        self._actions = np.array([0, *map(int, pattern)], dtype=np.int64)
+
+    def initial_memory(self, count: int) -> Memory:
+        return np.zeros((count, 1), dtype=np.int64)
+
+    def decide(self, frames: NDArray[np.int16], memory: Memory) -> Actions:
+        memory[:, 0] += 1
+        return self._actions[memory[:, 0] % len(self._actions)]
+
+
 class RandomTrigger(Policy):
     """Trigger with probability ``p``, independently at every slice.
 
@@ -153,6 +175,30 @@ class KeyframeRule(PrivilegedPolicy):
 
     def choose(self, truth: Truth, memory: Memory) -> bool:
         return truth.keyframe(int(memory[0]))
+
+
+class SpeedAge(PrivilegedPolicy):
+    """Trigger when the vehicle has come further than ``metres`` since the held depth frame was made.
+
+    The way is the speed of the moment times the age. Odometry gives it, but no observation does.
+    """
+
+    def __init__(self, metres: float) -> None:
+        super().__init__()
+        _check_threshold("metres", metres)
+        self.metres = metres
+
+    def initial_memory(self, count: int) -> Memory:
+        """Columns: slice acted on last, slice at which the held frame was made."""
+        return np.zeros((count, 2), dtype=np.int64)
+
+    def choose(self, truth: Truth, memory: Memory) -> bool:
+        index, held = memory.tolist()
+        lidar = truth.lidar(index)
+        trigger = not lidar and truth.ego_speed(index) * (index - held) * SLICE_US / 1e6 > self.metres
+        if lidar or trigger:
+            memory[1] = index
+        return trigger
 
 
 class GreedyDepthChange(PrivilegedPolicy):

@@ -2,6 +2,9 @@
 
     python benchmarks/inference.py [--checkpoint sunet2enresconv_best_model.pth] [--markdown docs/runtimes.md]
 
+Two networks in every runtime, and then whole extrapolators: the released one and ours, with the motion
+estimate, warp and features that ours needs, side by side in each runtime.
+
 The reference is the eager fp32 module under ``no_grad`` with the default allocator. Every row is a process
 of its own with the same weights and inputs; the processes take turns, a few repetitions each, so that
 whatever else the machine does meets all rows alike. Prints JSON; asserts nothing.
@@ -31,9 +34,9 @@ from torch import nn
 
 from agents.keyframe_cnn import FrameDetector
 from nl_env.config import SPLITS, DrivingConfig
-from nl_env.depth.extrapolators import PaperUNet, Warp
+from nl_env.depth.extrapolators import WEIGHTS, PaperUNet, Warp
 from nl_env.depth.learned import MotionWarpRefine
-from nl_env.depth.learned_networks import LearnedNetworks, load_learned
+from nl_env.depth.learned_networks import load_learned
 from nl_env.depth.runtime import NetworkRunner
 from nl_env.depth.unet import UNet, load_released
 from nl_env.history import SensorHistory
@@ -79,8 +82,8 @@ class Args:
     """Of every process."""
     intervals: int = 2
     """Simulated LiDAR intervals, four moments each, that are run in turn."""
-    ours: Path | None = None
-    """Weights of our extrapolator; random ones by default."""
+    ours: Path = WEIGHTS / "unet.safetensors"
+    """Weights of our extrapolator."""
     markdown: Path | None = None
     """Document whose results are replaced."""
 
@@ -148,9 +151,14 @@ def extrapolator_calls(
     if name == EXTRAPOLATORS[0]:
         extrapolator = PaperUNet(runner(paper_network(args)))
     else:
-        ours = our_networks(args)
-        assert ours.motion is not None and ours.refine is not None
-        extrapolator = MotionWarpRefine(runner(ours.motion), runner(ours.refine), threshold=ours.threshold)
+        ours = load_learned(args.ours)
+        extrapolator = MotionWarpRefine(
+            None if ours.motion is None else runner(ours.motion),
+            None if ours.refine is None else runner(ours.refine),
+            threshold=ours.threshold,
+            warped=ours.warped,
+            events=ours.events,
+        )
 
     def run(interval: Sequence[ExtrapolationInput]) -> list[NDArray[np.float32]]:
         extrapolator.reset()
@@ -165,14 +173,6 @@ def paper_network(args: Args) -> UNet:
         return load_released(args.checkpoint)
     with seeded(0):
         return UNet().eval()
-
-
-def our_networks(args: Args) -> LearnedNetworks:
-    """Our networks, with random weights if there are no others."""
-    if args.ours is not None:
-        return load_learned(args.ours)
-    with seeded(0):
-        return LearnedNetworks({}, {}).eval()
 
 
 def paper_inputs(moment: ExtrapolationInput) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -292,7 +292,7 @@ def table(results: Results) -> str:
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
     contests = {name: {row: (name, ROWS[row]) for row in ROWS} for name in (UNET, DETECTOR)}
-    for runtime in ("torch", "OpenVINO"):
+    for runtime in ("torch", "OpenVINO", "OpenVINO bf16"):
         contests[f"extrapolators, {runtime}"] = {name: (name, ROWS[runtime]) for name in EXTRAPOLATORS}
     results: Results = {}
     for title, contestants in contests.items():

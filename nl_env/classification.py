@@ -29,7 +29,8 @@ class Detection:
         seed: of the sequence.
         weather: its name.
         scores: ``(K,)``, higher means keyframe.
-        causes: ``(K, 3)`` bool, which of :data:`CAUSES` hold.
+        causes: ``(K, 3)`` bool, which of :data:`CAUSES` hold, or ``(K, 1)``, the label alone, where causes
+            are not known.
         lidar: ``(K,)`` bool, slices with a LiDAR frame.
     """
 
@@ -41,10 +42,11 @@ class Detection:
 
     def __post_init__(self) -> None:
         count = len(self.scores)
-        if self.scores.shape != (count,) or self.causes.shape != (count, 3) or self.lidar.shape != (count,):
+        known = self.causes.shape in ((count, len(CAUSES)), (count, 1))
+        if self.scores.shape != (count,) or not known or self.lidar.shape != (count,):
             raise ValueError(
                 f"detection: found scores {self.scores.shape}, causes {self.causes.shape}, "
-                f"lidar {self.lidar.shape}, expected (K,), (K, {len(CAUSES)}), (K,)"
+                f"lidar {self.lidar.shape}, expected (K,), (K, {len(CAUSES)}) or (K, 1), (K,)"
             )
         if not np.all(np.isfinite(self.scores)):
             raise ValueError(f"detection: found scores of sequence {self.seed} that are not finite")
@@ -76,7 +78,8 @@ class DetectorSummary:
         auroc: probability that a keyframe scores above another slice; needs no threshold.
         always_f1: F1 of always answering "keyframe".
         f1_gain: ``f1 - always_f1``, its interval paired by sequence.
-        recall_by_cause: share of the slices with that cause, alone or with others, that are found.
+        recall_by_cause: share of the slices with that cause, alone or with others, that are found; empty
+            where causes are not known.
         f1_by_cause: slices with that cause against slices that are no keyframes.
         f1_by_weather: pooled over the sequences of each weather.
     """
@@ -125,7 +128,7 @@ def summarise_detector(
                 for d, row in zip(detections, counts, strict=True)
             ]
         )
-        for i, cause in enumerate(CAUSES)
+        for i, cause in enumerate(CAUSES if all(d.causes.shape[1] > 1 for d in detections) else ())
     }
     rates = np.array([effective_rate(d, threshold) for d in detections])
     wins, pairs = _ordered_pairs(detections)

@@ -1,4 +1,4 @@
-"""Many policies on many sequences: the checkpoint of one sequence, the floor, and frame-rate curves."""
+"""Many policies on many sequences: the checkpoint of one sequence, summaries, curves and the floor."""
 
 from __future__ import annotations
 
@@ -23,13 +23,9 @@ from nl_env.evaluation import (
     resample_sequences,
     summarise,
 )
+from nl_env.frontier import ENDS, ORACLE, PERIODIC, Frontier, OperatingPoints, frontier, oracle_points
 from nl_env.traces import PlayerFrames, SequenceTrace
 from nl_env.types import SLICE_US, TriggerPolicy
-
-RATE_WINDOW_S = 1.0
-"""Frames are counted over this long for every frame-rate curve."""
-SPEED_BIN = 2.5
-"""Width of the bins of the rate-against-speed curve, m/s."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +39,7 @@ class PolicyInfo:
         listed: in the table; the others are points of their family's curve only.
         adaptive: its triggers depend on the scene.
         privileged: reads what no sensor gives (labels or true depth).
+        weights: file of a learned policy's weights where it is not the shipped one: one training each.
     """
 
     name: str
@@ -51,6 +48,7 @@ class PolicyInfo:
     listed: bool
     adaptive: bool
     privileged: bool
+    weights: str = ""
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,8 @@ class Comparison:
         saved: per policy, how much of the deciding error of the LiDAR alone it saves. Differences are taken
             within sequences, so the interval tells policies apart that share their sequences.
         floor: ``(N+1,)`` least mean deciding error for 0..N triggers in all sequences together.
-        shown: index of the sequence with frames, the one the page plays.
+        frontier: each family's curve and regret; None without periodic triggering, which sets their scale.
+        shown: index of the sequence with frames, the one the page plays; None without any.
     """
 
     settings: dict[str, Any]
@@ -172,7 +171,8 @@ class Comparison:
     summaries: tuple[PolicySummary, ...]
     saved: tuple[Estimate, ...]
     floor: NDArray[np.float64]
-    shown: int
+    frontier: Frontier | None
+    shown: int | None
 
     @property
     def floor_rates(self) -> NDArray[np.float64]:
@@ -200,7 +200,7 @@ def compare(
 
     Raises:
         ValueError: no results, sequences of different lengths (their mean would not be a time average),
-            policies that differ from the ones played, or no sequence with frames.
+            or policies that differ from the ones played.
     """
     if not results:
         raise ValueError("results: found none, expected at least one sequence")
@@ -213,8 +213,6 @@ def compare(
         if played != names:
             raise ValueError(f"results: sequence {result.seed} played {played}, expected {names}")
     shown = [i for i, result in enumerate(results) if result.frames is not None]
-    if not shown:
-        raise ValueError("results: found no sequence with frames, expected one for the player")
     resamples = resample_sequences(len(results), rng)
     held = np.array([[record.held[DECIDING_METRIC] for record in result.records] for result in results])
     lidar_alone = np.array([result.floor[0] / result.slices for result in results])
@@ -227,8 +225,37 @@ def compare(
         ),
         saved=tuple(estimate_mean(lidar_alone - errors, resamples) for errors in held.T),
         floor=pooled_floor([result.floor for result in results]) / (lengths[0] * len(results)),
-        shown=shown[0],
+        frontier=_frontier(policies, results, held.T, resamples),
+        shown=shown[0] if shown else None,
     )
+
+
+def _frontier(
+    policies: Sequence[PolicyInfo],
+    results: Sequence[SequenceResult],
+    errors: NDArray[np.float64],
+    resamples: NDArray[np.int64],
+) -> Frontier | None:
+    """Curves of the families of ``policies``, whose held-depth ``errors`` are ``(policies, sequences)``."""
+    rates = np.array([[record.effective_rate for record in result.records] for result in results]).T
+    members: dict[str, dict[str, list[int]]] = {}
+    for i, policy in enumerate(policies):
+        members.setdefault(policy.family, {}).setdefault(policy.weights, []).append(i)
+    families = {
+        family: [OperatingPoints(rates[indices], errors[indices]) for indices in trainings.values()]
+        for family, trainings in members.items()
+        if family not in (*ENDS, ORACLE)
+    }
+    if not any(family in families for family in PERIODIC):
+        return None
+    slices = results[0].slices
+    duration_s = slices * SLICE_US / 1e6
+    lidar_frames = int(results[0].lidar[1:].sum())
+    floors = [result.floor for result in results]
+    triggers = np.array([[0, len(floor) - 1] for floor in floors])
+    least = np.array([floor[[0, -1]] / slices for floor in floors])
+    ends = OperatingPoints((lidar_frames + triggers.T) / duration_s, least.T)
+    return frontier(families, oracle_points(floors, lidar_frames, slices, duration_s), ends, resamples)
 
 
 def pooled_floor(floors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -251,50 +278,3 @@ def pooled_floor(floors: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
             np.minimum(window, pooled + total, out=window)
         pooled = combined
     return pooled
-
-
-def rate_over_time(result: SequenceResult, policy: int) -> NDArray[np.float64]:
-    """``(K,)`` effective frame rate around slices 1..K, Hz, in a centred window of ``RATE_WINDOW_S``."""
-    frames = _frames_made(result, policy)
-    window = np.ones(min(len(frames), int(RATE_WINDOW_S * 1e6) // SLICE_US))
-    slices_seen = np.convolve(np.ones(len(frames)), window, mode="same")
-    return np.convolve(frames, window, mode="same") / (slices_seen * SLICE_US / 1e6)
-
-
-@dataclass(frozen=True)
-class RateBySpeed:
-    """Effective frame rate by ego speed; bins without a window are left out.
-
-    Attributes:
-        speed: ``(n,)`` centres of the bins, m/s.
-        rate: ``(n,)`` mean effective rate, Hz.
-        windows: ``(n,)`` int64, windows of ``RATE_WINDOW_S`` in each bin.
-    """
-
-    speed: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    windows: NDArray[np.int64]
-
-
-def rate_by_speed(results: Sequence[SequenceResult], policy: int) -> RateBySpeed:
-    """Cut all sequences into windows and average the frame rate over windows of similar mean speed."""
-    length = int(RATE_WINDOW_S * 1e6) // SLICE_US
-    speeds, rates = [], []
-    for result in results:
-        windows = result.slices // length
-        used = slice(0, windows * length)
-        speeds.append(result.ego_speed[1:][used].reshape(windows, length).mean(axis=1))
-        rates.append(_frames_made(result, policy)[used].reshape(windows, length).sum(axis=1) / RATE_WINDOW_S)
-    bins = (np.concatenate(speeds) // SPEED_BIN).astype(np.int64)
-    counts = np.bincount(bins)
-    totals = np.bincount(bins, weights=np.concatenate(rates))
-    filled = np.flatnonzero(counts)
-    centres = np.add(filled, 0.5, dtype=np.float64) * SPEED_BIN
-    return RateBySpeed(centres, totals[filled] / counts[filled], counts[filled])
-
-
-def _frames_made(result: SequenceResult, policy: int) -> NDArray[np.float64]:
-    """``(K,)`` 1 at slices 1..K with a LiDAR or an extrapolated frame, else 0."""
-    made = result.lidar[1:].astype(np.float64)
-    made[np.array(result.records[policy].triggers, np.int64) - 1] = 1.0
-    return made

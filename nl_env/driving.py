@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nl_env.config import DrivingConfig, EventCameraConfig, LidarConfig, SceneConfig
+from nl_env.costs import TriggerCost
 from nl_env.env import AdaptiveDepthEnv
 from nl_env.streams import SyntheticStream
 from nl_env.types import DepthExtrapolator
@@ -30,22 +31,30 @@ class DrivingEnv(AdaptiveDepthEnv):
     | `"image"` (default) | `Box(0, 255, (1, H, W), uint8)`, offset by 128 and clipped |
     | `"signed"` | `Box(-128, 127, (1, H, W), int8)`, clipped |
     | `"dict"` | `{"event_frame": image, "state": Box(0, 1, (4,), float32)}` |
+    | `"statistics"` | `Box(0, 1, (100,), float32)`: the state and the event activity of 12 regions |
 
     `state` holds the time since the last LiDAR frame and since the last depth frame (as shares of the LiDAR
     period; 0 where a LiDAR frame arrives at this slice), the event rate as `x / (1 + x)` with x events per
-    pixel and slice, and the last action.
+    pixel and slice, and the last action. The activity of a region is its share of pixels with events and
+    its mean absolute event sum, each over this slice, since the held depth frame was made, since the last
+    LiDAR frame, and over the LiDAR interval before (`nl_env.statistics`), compressed as `x / (x + 0.2)`.
+
+    With a range of trigger costs, `"dict"` gains `"trigger_cost"` `Box(0, 1, (1,), float32)` and
+    `"statistics"` one more last entry: 0 at 1e-4 to 1 at 1e2, logarithmic. The other modes refuse a range.
 
     ## Rewards
     `-(error / error_scale) - trigger_cost * triggered`, where the error compares the held depth with the
     true depth at the end of the slice. `log_mae`, the mean over all pixels of `|ln d - ln d_true|`, is the
-    default. Each part is in `info` as `reward/error` and `reward/trigger`.
+    default. Each part is in `info` as `reward/error` and `reward/trigger`. With `trigger_cost=(low, high)`
+    every episode draws its own cost, uniformly in the logarithm, and observations show it.
 
     ## Starting State
     `reset(seed=s)` runs sequence s: its seed determines scenario, style, weather, traffic and noise.
     `reset()` draws the next training sequence from the environment's own generator;
-    `reset(options={"sequence": s})` runs sequence s and leaves that generator alone. Seeds are split into
-    training, validation and test (`nl_env.config.SPLITS`). The LiDAR frame of t = 0 is held already; the
-    first observation shows the events of the first 20 ms.
+    `reset(options={"sequence": s})` runs sequence s and leaves that generator alone.
+    `reset(options={"trigger_cost": c})` sets the cost of the episode. Seeds are split into training,
+    validation and test (`nl_env.config.SPLITS`). The LiDAR frame of t = 0 is held already; the first
+    observation shows the events of the first 20 ms.
 
     ## Episode End
     Truncated at the end of the sequence, never terminated. The last observation repeats the last slice.
@@ -72,7 +81,8 @@ class DrivingEnv(AdaptiveDepthEnv):
     * `odometry`: let a named extrapolator use the true camera poses (False).
     * `runtime`: what runs a network: `"auto"` (CUDA where there is one, else PyTorch), `"torch"`,
       `"openvino"`, `"onnxruntime"` or `"cuda"`.
-    * `obs_mode`, `error`, `error_scale`, `trigger_cost`: see above.
+    * `obs_mode`, `error`, `error_scale`: see above.
+    * `trigger_cost`: a number (0.1), or a pair within 1e-4 to 1e2 of which each episode draws its own.
     * `render_mode`: `"rgb_array"`, `"depth_array"`, `"human"` or None.
 
     ## Version History
@@ -96,7 +106,7 @@ class DrivingEnv(AdaptiveDepthEnv):
         obs_mode: str = "image",
         error: str = "log_mae",
         error_scale: float = 0.05,
-        trigger_cost: float = 0.1,
+        trigger_cost: TriggerCost = 0.1,
         render_mode: str | None = None,
     ) -> None:
         config = DrivingConfig(

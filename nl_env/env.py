@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -11,13 +12,20 @@ from numpy.typing import NDArray
 
 from nl_env import rewards
 from nl_env.config import SPLITS, choice, number
+from nl_env.costs import ANY_COST, TriggerCost, check_trigger_cost, episode_cost
 from nl_env.depth.extrapolators import make_extrapolator
-from nl_env.depth.metrics import LOWER_IS_BETTER, METRIC_NAMES, full_metrics, paper_metrics
-from nl_env.history import SensorHistory
+from nl_env.depth.metrics import LOWER_IS_BETTER, METRIC_NAMES
+from nl_env.held_depth import ComputedDepth, HeldDepth
 from nl_env.keyframes import label_keyframe
 from nl_env.ledger import DepthLedger
-from nl_env.observations import make_observation, observation_space, state_vector
-from nl_env.types import SLICE_US, DepthExtrapolator, Extrapolation, Sample, SensorStream
+from nl_env.observations import (
+    image_observation,
+    make_observation,
+    observation_space,
+    state_vector,
+)
+from nl_env.statistics import ActivityMemory, slice_statistics
+from nl_env.types import SLICE_US, DepthExtrapolator, Sample, SensorStream
 from nl_env.viewer import PanelView, Timeline, Window, draw_panel
 
 INFO_METRICS = ("log_mae", "imae", "bad_25", "rmse", "abs_rel")
@@ -46,12 +54,14 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         odometry: give a named extrapolator the true camera poses.
         runtime: what runs a network: ``"auto"`` (CUDA where there is one, else PyTorch), ``"torch"``,
             ``"openvino"``, ``"onnxruntime"`` or ``"cuda"``.
-        obs_mode: ``"image"``, ``"signed"`` or ``"dict"``.
+        obs_mode: ``"image"``, ``"signed"``, ``"dict"`` or ``"statistics"``.
         error: the metric behind the reward; ``delta_n`` counts as ``1 - delta_n``.
         error_scale: the error that costs a reward of 1.
-        trigger_cost: reward paid for one extrapolation.
+        trigger_cost: reward paid for one extrapolation; with a pair each episode draws its own, uniformly in
+            the logarithm, and the observation shows it (modes ``"dict"`` and ``"statistics"``).
         min_depth: depths below are read as this one by the full-image metrics, m.
         render_mode: ``None``, ``"human"``, ``"rgb_array"`` or ``"depth_array"``.
+        held_depth: what makes and scores depth frames; None for the extrapolator.
 
     Raises:
         ValueError: unknown name (the message lists the valid ones) or a number out of range.
@@ -72,24 +82,34 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         obs_mode: str = "image",
         error: str = "log_mae",
         error_scale: float = 0.05,
-        trigger_cost: float = 0.1,
+        trigger_cost: TriggerCost = 0.1,
         min_depth: float = 1.0,
         render_mode: str | None = None,
+        held_depth: HeldDepth | None = None,
     ) -> None:
         choice("error", error, METRIC_NAMES)
         choice("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         number("error_scale", error_scale, 1e-9, 1e9)
-        number("trigger_cost", trigger_cost, 0.0, 1e9)
-        self.observation_space = observation_space(obs_mode, stream.camera.shape)
+        check_trigger_cost(trigger_cost)
+        self._cost_range: tuple[float, float] | None = None
+        if isinstance(trigger_cost, (tuple, list)):
+            self._cost_range = (float(trigger_cost[0]), float(trigger_cost[1]))
+        else:
+            self._fixed_cost = float(trigger_cost)
+        self.observation_space = observation_space(
+            obs_mode, stream.camera.shape, costs=self._cost_range is not None
+        )
         self.action_space = spaces.Discrete(2)
         self.render_mode = render_mode
         self._obs_mode = obs_mode
         self._error = error
         self._error_scale = error_scale
-        self._trigger_cost = trigger_cost
         self._min_depth = min_depth
         self._stream = stream
-        self._extrapolator = make_extrapolator(extrapolator, odometry=odometry, runtime=runtime)
+        if held_depth is None:
+            made = make_extrapolator(extrapolator, odometry=odometry, runtime=runtime)
+            held_depth = ComputedDepth(stream, made, min_depth)
+        self._held_depth = held_depth
         self._window = Window(self.metadata["render_fps"])
         self._running = False
         self._started = False
@@ -103,20 +123,26 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         Args:
             seed: seeds ``np_random`` and is the sequence to run. Without it the next training
                 sequence is drawn from ``np_random``.
-            options: ``{"sequence": int}`` runs that sequence whatever the seed.
+            options: ``{"sequence": int}`` runs that sequence whatever the seed; ``{"trigger_cost": float}``
+                sets this episode's cost.
+
+        Raises:
+            ValueError: unknown options, or a value out of range.
         """
         if self._closed:
             raise gym.error.ClosedEnvironmentError("reset: the environment is closed; make a new one")
         super().reset(seed=seed)
-        sequence = self._sequence(seed, options or {})
+        options = checked_options(options or {})
+        sequence = self._sequence(seed, options)
+        self._trigger_cost = self._draw_cost(options)
         sample = self._stream.reset(sequence)
-        self._extrapolator.reset()
+        self._held_depth.start()
         self._ledger = DepthLedger(self._stream.lidar_period)
-        self._history = SensorHistory(self._stream.camera, self._stream.max_depth, self._extrapolator)
+        self._activity = ActivityMemory() if self._obs_mode == "statistics" else None
         self._timeline = Timeline()
         self._running = self._started = True
         _, info = self._settle(sample, triggered=False)
-        self._pending = self._stream.advance()
+        self._receive()
         self._render_human()
         return self._observation(), info
 
@@ -124,13 +150,15 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         """Hold (0) or trigger (1) at the slice last observed, score it, and observe the next one."""
         self._require_running("step")
         sample = self._pending
-        triggered = self._ledger.act(sample.index, sample.lidar is not None, check_action(action))
+        triggered = self._ledger.act(sample.index, sample.has_lidar, check_action(action))
+        if self._activity is not None:
+            self._activity.act(triggered)
         reward, info = self._settle(sample, triggered)
         truncated = sample.index == self._stream.slices
         if truncated:
             self._running = False
         else:
-            self._pending = self._stream.advance()
+            self._receive()
         self._render_human()
         return self._observation(), reward, False, truncated, info
 
@@ -170,7 +198,7 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
     def depth(self) -> NDArray[np.float32]:
         """``(H, W)`` float32 m, the held depth frame; not a copy."""
         self._require_started("depth")
-        return self._held.depth
+        return self._held_depth.depth
 
     @property
     def true_depth(self) -> NDArray[np.float32]:
@@ -182,7 +210,29 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
     def prior_depth(self) -> NDArray[np.float32]:
         """``(H, W)`` float32 m, the last LiDAR frame; not a copy."""
         self._require_started("prior_depth")
-        return self._history.prior
+        return self._held_depth.prior
+
+    @property
+    def trigger_cost(self) -> float:
+        """What a trigger costs in the running episode."""
+        self._require_started("trigger_cost")
+        return self._trigger_cost
+
+    def set_trigger_cost(self, cost: float) -> None:
+        """Let triggers cost ``cost`` from the next action on, in this episode and those to come.
+
+        For constrained training, which adapts the cost while it learns.
+
+        Raises:
+            ValueError: not a number of at least 0, or the costs are drawn from a range.
+        """
+        if self._cost_range is not None:
+            raise ValueError(
+                f"set_trigger_cost: each episode draws its cost from {self._cost_range}, "
+                "expected an environment made with a single trigger_cost"
+            )
+        number("cost", cost, *ANY_COST)
+        self._fixed_cost = self._trigger_cost = float(cost)
 
     @property
     def stream(self) -> SensorStream:
@@ -190,27 +240,31 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
         return self._stream
 
     def _sequence(self, seed: int | None, options: dict[str, Any]) -> int:
-        for key in options:
-            choice("options key", key, ("sequence",))
         if "sequence" in options:
-            sequence = options["sequence"]
-            if not isinstance(sequence, (int, np.integer)) or sequence < 0:
-                raise ValueError(f"options['sequence']: found {sequence!r}, expected an integer >= 0")
-            return int(sequence)
+            return int(options["sequence"])
         if seed is not None:
             return int(seed)
         train = SPLITS["train"]
         return int(self.np_random.integers(train.start, train.stop))
 
+    def _draw_cost(self, options: dict[str, Any]) -> float:
+        """The cost of the episode that starts: given, drawn from the range, or the only one."""
+        return episode_cost(self._cost_range or self._fixed_cost, options, self.np_random)
+
+    def _receive(self) -> None:
+        """Take in the slice that the next action acts on."""
+        self._pending = self._stream.advance()
+        if self._activity is not None:
+            self._activity.see(self._statistics(self._pending), self._pending.has_lidar)
+
+    def _statistics(self, sample: Sample) -> NDArray[np.float32]:
+        """``(SLICE_STATISTICS,)`` float32 of the slice's image observation."""
+        return slice_statistics(image_observation(sample.event_frame)[0])
+
     def _settle(self, sample: Sample, triggered: bool) -> tuple[float, dict[str, Any]]:
         """Produce or hold the depth of ``sample``'s slice, score it, and return reward and info."""
-        self._history.add(sample)
-        if sample.lidar is not None:
-            self._held = Extrapolation(sample.lidar)
-        elif triggered:
-            self._held = self._extrapolate(sample)
+        scores = self._held_depth.settle(sample, triggered, self._ledger.age)
         self._scored = sample
-        scores = self._scores(sample)
         error = scores[self._error] if LOWER_IS_BETTER[self._error] else 1.0 - scores[self._error]
         parts = rewards.components(error, self._error_scale, triggered, self._trigger_cost)
         info = self._info(sample, triggered, scores, parts)
@@ -219,30 +273,13 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
             self._timeline.add(info["lidar"], triggered, info["keyframe"], error)
         return rewards.total(parts), info
 
-    def _extrapolate(self, sample: Sample) -> Extrapolation:
-        extrapolation = self._extrapolator(self._history.inputs(sample))
-        if extrapolation.depth.shape != sample.depth.shape:
-            raise ValueError(
-                f"extrapolator: found depth of shape {extrapolation.depth.shape}, "
-                f"expected {sample.depth.shape}"
-            )
-        return extrapolation
-
-    def _scores(self, sample: Sample) -> dict[str, float]:
-        """Both metric sets; the paper's, which ignore missing returns, use the depth if there were one."""
-        held, max_depth = self._held, self._stream.max_depth
-        paper_depth = held.depth if held.depth_if_return is None else held.depth_if_return
-        paper = paper_metrics(paper_depth, sample.depth, max_depth)
-        full = full_metrics(held.depth, sample.depth, max_depth, self._min_depth)
-        return dict(zip(METRIC_NAMES, (*paper, *full), strict=True))
-
     def _info(
-        self, sample: Sample, triggered: bool, scores: dict[str, float], parts: dict[str, float]
+        self, sample: Sample, triggered: bool, scores: Mapping[str, float], parts: dict[str, float]
     ) -> dict[str, Any]:
         label = label_keyframe(sample.state)
         return {
             "t": sample.t,
-            "lidar": sample.lidar is not None,
+            "lidar": sample.has_lidar,
             "triggered": triggered,
             "depth_age": self._ledger.age * SLICE_US,
             **{name: scores[name] for name in INFO_METRICS},
@@ -262,11 +299,17 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
 
     def _observation(self) -> Any:
         sample = self._pending
-        since_lidar, since_depth = self._ledger.staleness(sample.index, sample.lidar is not None)
+        since_lidar, since_depth = self._ledger.staleness(sample.index, sample.has_lidar)
         state = state_vector(
-            since_lidar, since_depth, sample.event_count, sample.depth.size, self._ledger.last_action
+            since_lidar, since_depth, sample.event_count, sample.event_frame.size, self._ledger.last_action
         )
-        return make_observation(self._obs_mode, sample.event_frame, state)
+        return make_observation(
+            self._obs_mode,
+            sample.event_frame,
+            state,
+            activity=None if self._activity is None else self._activity.observed(),
+            cost=None if self._cost_range is None else self._trigger_cost,
+        )
 
     def _panel(self) -> NDArray[np.uint8]:
         return draw_panel(
@@ -304,3 +347,13 @@ class AdaptiveDepthEnv(gym.Env[Any, Any]):
             raise gym.error.ResetNeeded(
                 f"{what}: the sequence ended at slice {self._stream.slices}; call reset() for the next"
             )
+
+
+def checked_options(options: dict[str, Any]) -> dict[str, Any]:
+    """The options of a reset; unknown ones and a bad sequence raise ``ValueError``."""
+    for key in options:
+        choice("options key", key, ("sequence", "trigger_cost"))
+    sequence = options.get("sequence", 0)
+    if not isinstance(sequence, (int, np.integer)) or sequence < 0:
+        raise ValueError(f"options['sequence']: found {sequence!r}, expected an integer >= 0")
+    return options

@@ -13,10 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.config import choice
 from nl_env.depth.metrics import METRIC_NAMES
 from nl_env.ledger import DepthLedger
-from nl_env.observations import IMAGE_OFFSET, OBS_MODES, make_observation, state_vector
+from nl_env.observations import (
+    IMAGE_OFFSET,
+    make_observation,
+    observation_space,
+    state_vector,
+    statistics_observation,
+)
+from nl_env.statistics import ActivityMemory
 from nl_env.traces import SequenceTrace
 from nl_env.types import SLICE_US, TriggerPolicy
 
@@ -42,7 +48,7 @@ class EnergyModel:
     extrapolation_j: float = 9.31e-3 * 30
     event_camera_w: float = 0.5
 
-    def energy(self, lidar_frames: int, triggers: int, duration_s: float) -> float:
+    def energy(self, lidar_frames: float, triggers: float, duration_s: float) -> float:
         """Energy of a sequence, J."""
         return (
             lidar_frames * self.lidar_frame_j
@@ -87,17 +93,29 @@ def play(
     trace: SequenceTrace,
     name: str,
     *,
-    obs_mode: str = "image",
+    obs_mode: str | None = None,
     energy: EnergyModel | None = None,
 ) -> EpisodeRecord:
     """Let ``policy`` act on slices 1..K of ``trace``, as it would in the environment.
 
     Privileged policies (``policy.privileged``) are handed the whole trace through ``policy.begin(trace)``.
+    A policy that was trained for many trigger costs has the one to show it in ``policy.trigger_cost``.
+
+    Args:
+        policy: what plays.
+        trace: what is played.
+        name: of the policy, for the record.
+        obs_mode: what the policy sees; None asks ``policy.obs_mode``, and ``"image"`` where it has none.
+        energy: what sensing and extrapolating cost.
 
     Raises:
-        ValueError: unknown ``obs_mode``, or the policy answers something else than 0 or 1.
+        ValueError: unknown ``obs_mode``, one that cannot show a cost to a policy that wants to see it, or
+            the policy answers something else than 0 or 1.
     """
-    choice("obs_mode", obs_mode, OBS_MODES)
+    shows = getattr(policy, "obs_mode", "image") if obs_mode is None else obs_mode
+    cost = getattr(policy, "trigger_cost", None)
+    observation_space(shows, trace.images.shape[1:], costs=cost is not None)  # refuses what cannot be shown
+    activity = ActivityMemory() if shows == "statistics" else None
     if getattr(policy, "privileged", False):
         policy.begin(trace)  # type: ignore[attr-defined]
     ledger = DepthLedger(trace.lidar_period)
@@ -106,24 +124,37 @@ def play(
     state: Any = None
     episode_start: NDArray[np.bool_] | None = np.array([True])
     for k in range(1, trace.slices + 1):
-        observation = _observation(obs_mode, trace, k, ledger)
+        if activity is not None:
+            activity.see(trace.statistics[k], bool(trace.lidar[k]))
+        observation = _observation(shows, trace, k, ledger, activity, cost)
         action, state = policy.predict(observation, state=state, episode_start=episode_start)
         episode_start = None  # for SB3 and for the rules alike: nothing has just been reset
         if action not in (0, 1):
             raise ValueError(f"policy {name!r}: found action {action!r} at slice {k}, expected 0 or 1")
         triggered[k - 1] = ledger.act(k, bool(trace.lidar[k]), int(action))
+        if activity is not None:
+            activity.act(triggered[k - 1])
         ages[k - 1] = ledger.age
     return _record(name, trace, triggered, ages, ledger, energy or EnergyModel())
 
 
-def _observation(obs_mode: str, trace: SequenceTrace, k: int, ledger: DepthLedger) -> Any:
+def _observation(
+    obs_mode: str,
+    trace: SequenceTrace,
+    k: int,
+    ledger: DepthLedger,
+    activity: ActivityMemory | None,
+    cost: float | None,
+) -> Any:
     """The environment's observation at slice ``k``."""
     image = trace.images[k]
     if obs_mode == "image":
         return image[None]
     since_lidar, since_depth = ledger.staleness(k, bool(trace.lidar[k]))
     state = state_vector(since_lidar, since_depth, int(trace.event_count[k]), image.size, ledger.last_action)
-    return make_observation(obs_mode, image.astype(np.int16) - np.int16(IMAGE_OFFSET), state)
+    if activity is not None:
+        return statistics_observation(state, activity.observed(), cost)
+    return make_observation(obs_mode, image.astype(np.int16) - np.int16(IMAGE_OFFSET), state, cost=cost)
 
 
 def _record(

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from nl_env.colours import INFERNO, VIRIDIS
-from nl_env.comparison import Comparison, rate_over_time
+from nl_env.comparison import Comparison
 from nl_env.depth.metrics import FULL_METRICS, PAPER_METRICS
-from nl_env.plots import family_colours
-from nl_env.tables import NOTES, metric_label
+from nl_env.frame_rates import RATE_WINDOW_S
+from nl_env.plots import curve_colours
+from nl_env.tables import FRONTIER_NOTES, NOTES, metric_label
 from nl_env.traces import NEAREST_SHARE
 from nl_env.types import SLICE_US
 
@@ -28,9 +29,11 @@ def html_report(comparison: Comparison, results: dict[str, Any]) -> str:
             "full": [[name, metric_label(name)] for name in FULL_METRICS],
             "paper": [[name, metric_label(name)] for name in PAPER_METRICS],
         },
-        "colours": family_colours(comparison.policies),
+        "colours": curve_colours(comparison),
         "notes": NOTES.replace("\\", ""),
-        "player": _player_json(comparison),
+        "frontier_notes": FRONTIER_NOTES.replace("`", ""),
+        "slice_s": SLICE_US / 1e6,
+        "player": None if comparison.shown is None else _player_json(comparison),
     }
     # "<" cannot end the script element that holds the data.
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
@@ -39,10 +42,10 @@ def html_report(comparison: Comparison, results: dict[str, Any]) -> str:
 
 def _player_json(comparison: Comparison) -> dict[str, Any]:
     """What the player needs next to the frames: it rebuilds any policy's held depth from the triggers."""
+    assert comparison.shown is not None
     result = comparison.sequences[comparison.shown]
     assert result.frames is not None
     frames, rows, columns = result.frames.events.shape
-    listed = [i for i, policy in enumerate(comparison.policies) if policy.listed]
     return {
         "seed": result.seed,
         "description": result.description,
@@ -50,6 +53,7 @@ def _player_json(comparison: Comparison) -> dict[str, Any]:
         "rows": rows,
         "columns": columns,
         "slice_s": SLICE_US / 1e6,
+        "rate_window": int(RATE_WINDOW_S * 1e6) // SLICE_US,
         "max_depth": result.frames.max_depth,
         "nearest_share": NEAREST_SHARE,
         "lidar": np.flatnonzero(result.lidar).tolist(),
@@ -60,19 +64,21 @@ def _player_json(comparison: Comparison) -> dict[str, Any]:
         "error_colours": INFERNO.ravel().tolist(),
         "policies": [
             {
-                "name": comparison.policies[i].name,
-                "family": comparison.policies[i].family,
-                "adaptive": comparison.policies[i].adaptive,
-                "triggers": list(result.records[i].triggers),
-                "rate": np.round(rate_over_time(result, i), 2).tolist(),
+                "name": policy.name,
+                "family": policy.family,
+                "listed": policy.listed,
+                "adaptive": policy.adaptive,
+                "triggers": list(record.triggers),
             }
-            for i in listed
+            for policy, record in zip(comparison.policies, result.records, strict=True)
         ],
     }
 
 
 def _packed_frames(comparison: Comparison) -> str:
     """Events, truth, and produced minus truth (mod 256, mostly zeros) as gzipped bytes in base64."""
+    if comparison.shown is None:
+        return ""
     frames = comparison.sequences[comparison.shown].frames
     assert frames is not None
     raw = np.stack([frames.events, frames.truth, frames.produced - frames.truth])

@@ -10,12 +10,36 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from nl_env.comparison import Comparison, PolicyInfo, rate_by_speed, rate_over_time
+from nl_env.comparison import Comparison, PolicyInfo
 from nl_env.evaluation import DECIDING_METRIC, Estimate, PolicySummary
+from nl_env.frame_rates import rate_by_speed, rate_over_time
+from nl_env.frontier import ORACLE, PERIODIC, PERIODIC_CURVE, Frontier
 from nl_env.types import SLICE_US
 
-PALETTE = ("#4269d0", "#e4572e", "#3ca951", "#a463f2", "#d99a00", "#17a2a2", "#d6569c", "#9c6b4e")
+PALETTE = (
+    "#4269d0",
+    "#e4572e",
+    "#3ca951",
+    "#a463f2",
+    "#d99a00",
+    "#17a2a2",
+    "#d6569c",
+    "#9c6b4e",
+    "#6b8e23",
+    "#7b5cd6",
+    "#c2410c",
+    "#0e7490",
+    "#be185d",
+    "#1f2a44",
+    "#f2789f",
+    "#84a59d",
+    "#b5179e",
+    "#e0a458",
+    "#006d77",
+    "#7f5539",
+)
 NEUTRAL = "#8a8f98"
 """Colour of families without a knob that look at nothing: the end points of every curve."""
 
@@ -31,17 +55,22 @@ def family_colours(policies: Sequence[PolicyInfo]) -> dict[str, str]:
 
 
 def adaptive_policies(comparison: Comparison) -> list[int]:
-    """Listed policies whose frame rate follows the scene."""
-    return [i for i, policy in enumerate(comparison.policies) if policy.listed and policy.adaptive]
+    """Listed policies whose frame rate follows the scene; of several trainings the first."""
+    chosen: dict[tuple[str, float | None], int] = {}
+    for i, policy in enumerate(comparison.policies):
+        if policy.listed and policy.adaptive:
+            chosen.setdefault((policy.family, policy.parameter), i)
+    return list(chosen.values())
 
 
 def save_plots(comparison: Comparison, folder: Path) -> None:
-    """Write ``error_vs_rate.png``, ``rate_vs_time.png`` and ``rate_vs_speed.png`` into ``folder``."""
-    for name, draw, height in (
-        ("error_vs_rate", draw_error_against_rate, 4.6),
-        ("rate_vs_time", draw_rate_over_time, 4.6),
-        ("rate_vs_speed", draw_rate_by_speed, 3.8),
-    ):
+    """Write into ``folder`` one PNG for every figure that the comparison has the numbers for."""
+    figures = [("error_vs_rate", draw_error_against_rate, 4.6), ("rate_vs_speed", draw_rate_by_speed, 3.8)]
+    if comparison.frontier is not None:
+        figures.append(("frontier", draw_frontier, 7.6))
+    if comparison.shown is not None:
+        figures.append(("rate_vs_time", draw_rate_over_time, 4.6))
+    for name, draw, height in figures:
         figure = Figure(figsize=(7.2, height), layout="constrained")
         FigureCanvasAgg(figure)
         draw(comparison, figure)
@@ -65,8 +94,44 @@ def draw_error_against_rate(comparison: Comparison, figure: Figure) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
+def draw_frontier(comparison: Comparison, figure: Figure) -> None:
+    """Every family's curve, and below it the share of the possible gain that it reaches."""
+    frontier = comparison.frontier
+    assert frontier is not None
+    above, below = (_axes(axes) for axes in figure.subplots(2, 1, sharex=True, height_ratios=(3, 2)))
+    colours = curve_colours(comparison)
+    shares = gap_closed(frontier)
+    for curve in frontier.families:
+        colour, dashes = colours[curve.family], "--" if curve.family == ORACLE else "-"
+        label = f"{curve.family} ({curve.regret.mean:.2f})"
+        above.plot(curve.rate, curve.error, color=colour, ls=dashes, lw=1.4, label=label)
+        below.plot(curve.rate, shares[curve.family], color=colour, ls=dashes, lw=1.4)
+    above.set(ylabel=f"held-depth error, {DECIDING_METRIC}")
+    above.legend(frameon=False, fontsize=7, title="family (regret)", title_fontsize=7, ncols=2)
+    below.set(xlabel="effective frame rate (Hz)", ylabel="share of the gap closed", ylim=(-0.25, 1.05))
+
+
+def curve_colours(comparison: Comparison) -> dict[str, str]:
+    """A colour for each curve of the frontier; the oracle's is black."""
+    colours = family_colours(comparison.policies)
+    periodic = next((colours[name] for name in PERIODIC if name in colours), NEUTRAL)
+    return {**colours, PERIODIC_CURVE: periodic, ORACLE: "#000000"}
+
+
+def gap_closed(frontier: Frontier) -> dict[str, NDArray[np.float64]]:
+    """Per family and rate, how much of the way from periodic triggering to the oracle it goes.
+
+    nan near the ends, where all curves meet.
+    """
+    periodic, oracle = frontier[PERIODIC_CURVE].error, frontier[ORACLE].error
+    gap = periodic - oracle
+    gap = np.where(gap > 0.05 * gap.max(), gap, np.nan)
+    return {curve.family: (periodic - curve.error) / gap for curve in frontier.families}
+
+
 def draw_rate_over_time(comparison: Comparison, figure: Figure) -> None:
     """Frame rate of the adaptive policies on the shown sequence, over the ego speed."""
+    assert comparison.shown is not None
     result = comparison.sequences[comparison.shown]
     above, below = (_axes(axes) for axes in figure.subplots(2, 1, sharex=True, height_ratios=(3, 1)))
     seconds = np.arange(result.slices + 1) * SLICE_US / 1e6

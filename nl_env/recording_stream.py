@@ -55,6 +55,11 @@ class RecordingStream:
         """Seeds of the recorded sequences, ascending."""
         return tuple(self._files)
 
+    @property
+    def files(self) -> dict[int, Path]:
+        """Files of the recorded sequences by ascending seed."""
+        return dict(self._files)
+
     def reset(self, seed: int) -> Sample:
         """Start the recording of ``seed`` and return sample 0.
 

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from nl_env.config import SPLITS, choice
+from nl_env.costs import TriggerCost
 from nl_env.elidar import find_files
 from nl_env.elidar.layout import HDF5_SUFFIXES, RANGE, hdf5_kind
 from nl_env.elidar_stream import ElidarStream
-from nl_env.env import AdaptiveDepthEnv
+from nl_env.env import INFO_METRICS, AdaptiveDepthEnv
+from nl_env.held_depth import HeldDepth
 from nl_env.recording import Recording
 from nl_env.recording_stream import RecordingStream
+from nl_env.trace_files import default_folder
+from nl_env.trace_source import identify_extrapolator
+from nl_env.trace_stream import TabulatedDepth, TraceFolder, TraceStream
 from nl_env.types import DepthExtrapolator, Sample
 
 INDOOR_RANGE = 20.0
@@ -61,6 +70,10 @@ class ReplayEnv(AdaptiveDepthEnv):
     * `split`: `"train"`, `"val"` or `"test"` (ELiDAR: `"train"` or `"test"`), or None (default) for all.
     * `sequences`: seeds of recordings, or names of ELiDAR sequences, or None (default) for all.
     * `lidar_hz`, `beams`: recordings only, another LiDAR than the recorded one; None keeps it.
+    * `errors`: `"compute"` (default) runs the extrapolator; `"table"` looks its errors up in what
+      `scripts/precompute.py` stored: the same observations, rewards and infos without a network, and without
+      depth frames: `env.unwrapped.depth` and its like raise `RuntimeError`. Recordings only.
+    * `tables`: folder of the stored traces; None is `DATA-tables-EXTRAPOLATOR`, beside the data.
     * `max_depth`, `fov`: ELiDAR only, range in m (200; indoors 9), horizontal field of view in degrees (75).
     * `on_error`: ELiDAR only, `"raise"` (default) or `"skip"` for broken sequences.
     * `extrapolator`, `odometry`, `runtime`, `obs_mode`, `error`, `error_scale`, `trigger_cost`,
@@ -82,23 +95,41 @@ class ReplayEnv(AdaptiveDepthEnv):
         max_depth: float = RANGE,
         fov: float = 75.0,
         on_error: str = "raise",
+        errors: str = "compute",
+        tables: str | Path | None = None,
         extrapolator: str | DepthExtrapolator = "unet",
         odometry: bool = False,
         runtime: str = "auto",
         obs_mode: str = "image",
         error: str = "log_mae",
         error_scale: float = 0.05,
-        trigger_cost: float = 0.1,
+        trigger_cost: TriggerCost = 0.1,
         render_mode: str | None = None,
     ) -> None:
+        choice("errors", errors, ("compute", "table"))
+        if tables is not None and errors != "table":
+            raise ValueError(f"tables: found {str(tables)!r} with errors={errors!r}, expected errors='table'")
         recordings = find_recordings(Path(data))
-        stream: RecordingStream | ElidarStream
+        stream: RecordingStream | ElidarStream | TraceStream
+        held_depth: HeldDepth | None = None
         if recordings:
             stream = recording_stream(recordings, split, sequences, lidar_hz, beams)
+            if odometry:
+                require_poses(recordings)
+            if errors == "table":
+                if render_mode is not None:
+                    raise ValueError(
+                        f"render_mode: found {render_mode!r} with errors='table', which has no depth frames "
+                        "to draw, expected None or errors='compute'"
+                    )
+                stream = trace_stream(stream, Path(data), tables, extrapolator, odometry)
+                held_depth = TabulatedDepth(stream, dict.fromkeys((*INFO_METRICS, error)))
             self._sequences = stream.seeds
             self.found = f"{len(stream.seeds)} recordings"
             min_depth = OUTDOOR_MIN_DEPTH
         else:
+            if errors == "table":
+                raise ValueError(f"errors: found 'table', but {data} holds ELiDAR; expected 'compute'")
             if odometry:
                 raise ValueError(f"odometry: found True, but ELiDAR ({data}) holds no poses; expected False")
             if lidar_hz is not None or beams is not None:
@@ -125,15 +156,19 @@ class ReplayEnv(AdaptiveDepthEnv):
             trigger_cost=trigger_cost,
             min_depth=min_depth,
             render_mode=render_mode,
+            held_depth=held_depth,
         )
 
     def _sequence(self, seed: int | None, options: dict[str, Any]) -> int:
-        if "sequence" in options or seed in self._sequences:
-            return super()._sequence(seed, options)
-        return int(self._sequences[self.np_random.integers(len(self._sequences))])
+        return choose_sequence(self._sequences, seed, options, self.np_random)
+
+    def _statistics(self, sample: Sample) -> NDArray[np.float32]:
+        if isinstance(self._stream, TraceStream):  # described once for all episodes
+            return self._stream.trace.statistics[sample.index]
+        return super()._statistics(sample)
 
     def _info(
-        self, sample: Sample, triggered: bool, scores: dict[str, float], parts: dict[str, float]
+        self, sample: Sample, triggered: bool, scores: Mapping[str, float], parts: dict[str, float]
     ) -> dict[str, Any]:
         info = super()._info(sample, triggered, scores, parts)
         if isinstance(self._stream, ElidarStream):  # steps differ in length
@@ -143,6 +178,17 @@ class ReplayEnv(AdaptiveDepthEnv):
             info["depth_age"] = sample.t - times[ledger.held_index]
             info["effective_rate"] = frames * 1e6 / elapsed if elapsed else 0.0
         return info
+
+
+def choose_sequence(
+    sequences: Sequence[int], seed: int | None, options: Mapping[str, Any], rng: np.random.Generator
+) -> int:
+    """The sequence of an episode that starts: given by ``options`` or ``seed``, or else drawn."""
+    if "sequence" in options:
+        return int(options["sequence"])
+    if seed is not None and seed in sequences:
+        return int(seed)
+    return sequences[int(rng.integers(len(sequences)))]
 
 
 def find_recordings(data: Path) -> list[Path]:
@@ -204,6 +250,50 @@ def recording_stream(
         beams=recorded.beams if beams is None else beams,
     )
     return RecordingStream(wanted, lidar)
+
+
+def trace_stream(
+    recordings: RecordingStream,
+    data: Path,
+    tables: str | Path | None,
+    extrapolator: str | DepthExtrapolator,
+    odometry: bool,
+) -> TraceStream:
+    """The stored traces of ``recordings`` as a stream.
+
+    Args:
+        recordings: what is replayed, with its LiDAR.
+        data: where the recordings lie.
+        tables: folder of the traces; None finds it beside ``data``.
+        extrapolator, odometry: what must have made them.
+
+    Raises:
+        TypeError: an extrapolator that is no name and no path.
+        FileNotFoundError: no traces, or none of a recording.
+        ValueError: traces of another extrapolator or LiDAR, or damaged ones.
+    """
+    if not isinstance(extrapolator, (str, os.PathLike)):
+        raise TypeError(
+            f"extrapolator: found {extrapolator!r} with errors='table', expected a name or a path to weights"
+        )
+    identity = identify_extrapolator(extrapolator, odometry)
+    folder = default_folder(data, extrapolator, odometry) if tables is None else Path(tables)
+    lidar = recordings.config.lidar
+    return TraceStream(
+        TraceFolder(folder, recordings.files, identity, lidar, OUTDOOR_MIN_DEPTH),
+        recordings.camera,
+        recordings.max_depth,
+        recordings.slices,
+        recordings.lidar_period,
+    )
+
+
+def require_poses(paths: Sequence[Path]) -> None:
+    """Raise ``ValueError`` if a recording was imported: real event cameras come without camera poses."""
+    for path in paths:
+        with Recording(path) as recording:
+            if "layout" in recording.description:
+                raise ValueError(f"odometry: found True, but {path} holds no poses; expected False")
 
 
 def _seed(path: Path) -> int:

@@ -14,15 +14,16 @@ from typing import Any
 import numpy as np
 
 import nl_env
-from nl_env.comparison import Comparison, rate_by_speed
+from nl_env.comparison import Comparison
 from nl_env.evaluation import DECIDING_METRIC
+from nl_env.frame_rates import KINDS, rate_by_kind, rate_by_speed
 from nl_env.page import html_report
 from nl_env.plots import adaptive_policies, save_plots
 from nl_env.runs import write_text
 from nl_env.tables import markdown_report
 from nl_env.types import SLICE_US
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of ``results.json``; grows when a field changes its meaning or goes."""
 
 CURVE_POINTS = 200
@@ -63,12 +64,17 @@ def results_json(comparison: Comparison) -> dict[str, Any]:
                 "rate": comparison.floor_rates[keep].tolist(),
                 "error": comparison.floor[keep].tolist(),
             },
+            "frontier": None if comparison.frontier is None else _plain(comparison.frontier.families),
             "rate_by_speed": {
-                comparison.policies[i].name: {
-                    name: values.tolist()
-                    for name, values in vars(rate_by_speed(comparison.sequences, i)).items()
-                }
+                comparison.policies[i].name: _plain(rate_by_speed(comparison.sequences, i))
                 for i in adaptive_policies(comparison)
+            },
+            "rate_by_kind": {
+                entry: {
+                    comparison.policies[i].name: _plain(rate_by_kind(comparison.sequences, i, entry))
+                    for i in adaptive_policies(comparison)
+                }
+                for entry in KINDS
             },
         }
     )
@@ -89,6 +95,15 @@ def _policy_json(comparison: Comparison, index: int) -> dict[str, Any]:
             "error": [record.held[DECIDING_METRIC] for record in records],
         },
     }
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses as objects, arrays and tuples as lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: _plain(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def _null_for_nan(value: Any) -> Any:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from nl_env.comparison import Comparison
 from nl_env.depth.metrics import FULL_METRICS, LOWER_IS_BETTER, PAPER_METRICS
-from nl_env.evaluation import DECIDING_METRIC, Estimate, PolicySummary
+from nl_env.evaluation import DECIDING_METRIC, EnergyModel, Estimate, PolicySummary
+from nl_env.frontier import BASELINE, MATCHED_RATES, Frontier
 
 UNITS = {"rmse": "m", "sq_rel": "m", "imae": "1/km", "irmse": "1/km"}
 """Metrics not listed are pure numbers or shares."""
@@ -20,6 +21,18 @@ frames alone. Precision, recall and F1 are against the paper's keyframe rule at 
 without a LiDAR frame; the row `always` is the all-positive answer. Intervals are 95 % percentile
 bootstraps over sequences. Power: 0.8 J a LiDAR frame (VLP-16 data sheet, 8 W at 10 Hz), 0.28 J an
 extrapolation (the paper's 9.31 ms at an assumed 30 W), 0.5 W for the event camera (the paper's figure).
+"""
+
+FRONTIER_NOTES = """\
+Curves are lower convex hulls of a family's operating points and of holding or triggering always: between two
+points one can switch over time. `regret`: area between the curve and the optimal oracle's over all frame
+rates, divided by the area between periodic triggering's and the oracle's; `periodic` is the best of spreading
+triggers evenly (families `periodic` and `evenly`), and `schedule` the best of all fixed schedules of an
+interval. The columns in Hz give the held-depth error at that effective rate. `Hz as good as periodic`: the
+rate at which the family reaches the error of periodic triggering at 40.6 Hz, the mean rate of the paper's
+rule, and the power that this takes. Second table: differences in units of 1e-5. Intervals are 95 % bootstraps
+over sequences, paired: all policies play the same sequences. Several trainings are averaged; in brackets the
+lowest and highest regret of one.
 """
 
 _COLUMNS: tuple[tuple[str, Callable[[PolicySummary, Estimate, float], str]], ...] = (
@@ -66,11 +79,65 @@ def markdown_report(comparison: Comparison) -> str:
         f"{name} {value}" for name, value in comparison.settings.items() if name != "policies"
     )
     parts = ["# Trigger policies compared", settings, _markdown(_overview(comparison)), NOTES]
+    if comparison.frontier is not None:
+        parts += ["## Frontier", frontier_markdown(comparison.frontier), FRONTIER_NOTES]
     for title, frames in _METRIC_TABLES:
         parts.append(f"## {title}")
         for metrics in (FULL_METRICS, PAPER_METRICS):
             parts.append(_markdown(_metric_rows(comparison, metrics, frames)))
     return "\n\n".join(parts) + "\n"
+
+
+def frontier_markdown(frontier: Frontier) -> str:
+    """Regret and matched operating points of every family, the best first."""
+    return _markdown(frontier_rows(frontier)) + "\n\n" + _markdown(matched_rows(frontier))
+
+
+def frontier_rows(frontier: Frontier) -> list[list[str]]:
+    """A header row, then one row per family: its regret and what it reaches at matched rates."""
+    rates = [f"{rate:g} Hz" for rate in MATCHED_RATES]
+    energy = EnergyModel()
+    rows = [["family", "regret", "95 %", "trainings", *rates, "Hz as good as periodic", "W there"]]
+    for curve in frontier.families:
+        errors = {matched.rate: matched.error for matched in curve.matched}
+        spread = f"{curve.runs} ({curve.regret_low:.3f}-{curve.regret_high:.3f})" if curve.runs > 1 else ""
+        needed, lidar_hz = curve.rate_for_periodic.mean, float(curve.rate[0])
+        rows.append(
+            [
+                curve.family,
+                _cell(curve.regret, 3),
+                _interval(curve.regret, 3) if math.isfinite(curve.regret.mean) else "-",
+                spread,
+                *(_cell(errors[rate], 5) if rate in errors else "-" for rate in MATCHED_RATES),
+                _cell(curve.rate_for_periodic, 1),
+                _fixed(energy.energy(lidar_hz, needed - lidar_hz, 1.0), 1) if math.isfinite(needed) else "-",
+            ]
+        )
+    return rows
+
+
+def matched_rows(frontier: Frontier) -> list[list[str]]:
+    """Differences at matched rates: from periodic triggering, and from the paper's detector if it played."""
+    rows = [["family"]]
+    rows[0] += [f"below periodic, {rate:g} Hz" for rate in MATCHED_RATES]
+    baseline = any(matched.below_baseline for curve in frontier.families for matched in curve.matched)
+    if baseline:
+        rows[0] += [f"below {BASELINE}, {rate:g} Hz" for rate in MATCHED_RATES]
+    for curve in frontier.families:
+        at = {matched.rate: matched for matched in curve.matched}
+        differences = [at[rate].saved if rate in at else None for rate in MATCHED_RATES]
+        if baseline:
+            differences += [at[rate].below_baseline if rate in at else None for rate in MATCHED_RATES]
+        rows.append([curve.family, *(_difference(estimate) for estimate in differences)])
+    return rows
+
+
+def _difference(estimate: Estimate | None) -> str:
+    """Times 1e5, with its interval."""
+    if estimate is None or not math.isfinite(estimate.mean):
+        return "-"
+    mean, low, high = (round(1e5 * value) for value in (estimate.mean, estimate.low, estimate.high))
+    return f"{mean} ({low} to {high})"
 
 
 def metric_label(name: str) -> str:
@@ -111,8 +178,8 @@ def _cell(estimate: Estimate, digits: int) -> str:
     return _fixed(estimate.mean, digits) if math.isfinite(estimate.mean) else "-"
 
 
-def _interval(estimate: Estimate) -> str:
-    return f"{_fixed(estimate.low, 4)}-{_fixed(estimate.high, 4)}"
+def _interval(estimate: Estimate, digits: int = 4) -> str:
+    return f"{_fixed(estimate.low, digits)}-{_fixed(estimate.high, digits)}"
 
 
 def _fixed(value: float, digits: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from nl_env.depth.metrics import METRIC_NAMES, full_metrics, paper_metrics
 from nl_env.history import SensorHistory
 from nl_env.keyframes import label_keyframe
 from nl_env.observations import image_observation
+from nl_env.statistics import slice_statistics
 from nl_env.types import DepthExtrapolator, Extrapolation, Sample, SensorStream
 
 PLAYER_ROWS = 120
@@ -87,6 +89,11 @@ class SequenceTrace:
     def slices(self) -> int:
         """Index of the last slice (K)."""
         return len(self.lidar) - 1
+
+    @cached_property
+    def statistics(self) -> NDArray[np.float32]:
+        """``(K+1, SLICE_STATISTICS)`` float32: :func:`nl_env.statistics.slice_statistics` of the images."""
+        return slice_statistics(self.images)
 
 
 def trace_sequence(

@@ -111,6 +111,11 @@ class Sample:
     state: EgoState
 
     @property
+    def has_lidar(self) -> bool:
+        """Whether a LiDAR frame arrives."""
+        return self.lidar is not None
+
+    @property
     def active_fraction(self) -> float:
         """Share of pixels whose event frame is not zero."""
         return float(np.count_nonzero(self.event_frame)) / self.event_frame.size

@@ -10,7 +10,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,8 +22,9 @@ import tyro
 from tqdm import tqdm
 
 import nl_env
-from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
+from agents.catalogue import FAMILIES, PolicyName, make_policy, parse_policy
 from agents.oracle import oracle_curve
+from agents.schedules import Scheduler
 from nl_env.comparison import PolicyInfo, SequenceResult, compare, evaluate_sequence
 from nl_env.config import (
     SPLITS,
@@ -44,8 +45,38 @@ from nl_env.traces import trace_sequence
 SEQUENCES_PER_SEED = 1_000
 """Runs of different --seed share no sequence."""
 
+SWEEP_STEP = 2
+"""Every second number of an adaptive family's sweep is enough for a curve of few sequences."""
+
 ENDPOINTS = ("never", "always")
 """Always compared: the ends of every curve; "always" is also the all-positive keyframe detector."""
+
+
+ROWS = (
+    "keyframe-cnn",
+    "keyframe-cnn-temporal",
+    "evenly:40",
+    "periodic:2",
+    "schedule:0100",
+    "event-rate:0.125",
+    "accumulated:0.5",
+    "accumulated-weighted",
+    "speed-age",
+    "value-reduction",
+    "value-clone:0.3",
+    "rl",
+    "keyframe-rule",
+    "greedy",
+    "oracle:20",
+    "oracle:30",
+    "oracle:40",
+)
+"""The table's policies by default."""
+
+
+def available(names: Sequence[str]) -> tuple[str, ...]:
+    """Those of ``names`` that can be made: the weights of learned policies may not be there."""
+    return tuple(name for name in names if FAMILIES[parse_policy(name).family].available)
 
 
 @dataclass(frozen=True)
@@ -54,7 +85,7 @@ class Settings:
 
     sequences: int = 8
     """Number of test sequences."""
-    duration: float = 12.0
+    duration: float = 10.0
     """Length of each, seconds."""
     seed: int = 0
     """Which test sequences; another seed gives others. Also seeds the bootstrap."""
@@ -68,24 +99,9 @@ class Settings:
     """unet (ours), unet-paper, repeat, linear, exponential, warp, or a path to weights."""
     odometry: bool = False
     """Give the extrapolator the true ego motion."""
-    policies: tuple[str, ...] = (
-        "keyframe-cnn",
-        "keyframe-cnn-temporal",
-        "evenly:40",
-        "event-rate:0.125",
-        "event-rate-hysteresis",
-        "periodic:2",
-        "random:0.5",
-        "keyframe-rule",
-        "greedy",
-        "oracle:20",
-        "oracle:30",
-        "oracle:40",
-    )
-    """Rows of the table beside never and always: FAMILY or FAMILY:NUMBER. Families: keyframe-cnn and
-    keyframe-cnn-temporal (probability of a keyframe), evenly (effective rate, Hz), periodic (every n-th
-    slice), random (probability), event-rate and event-rate-hysteresis (share of active pixels),
-    keyframe-rule, greedy (log_mae of holding), oracle (effective rate, Hz)."""
+    policies: tuple[str, ...] = field(default_factory=lambda: available(ROWS))
+    """Rows of the table beside never and always: FAMILY, FAMILY:NUMBER or FAMILY@WEIGHTS:NUMBER. Families
+    and their numbers: docs/policies.md. By default learned policies take part if they are shipped."""
     sweep: bool = True
     """Also vary each family's number, which draws the curves."""
 
@@ -106,6 +122,11 @@ class Settings:
             events=EventCameraConfig.preset(self.noise),
             lidar=LidarConfig(rate_hz=self.lidar_hz),
         )
+
+    @property
+    def infos(self) -> list[PolicyInfo]:
+        """Everything that plays."""
+        return policy_infos(self.policies, self.sweep, SWEEP_STEP)
 
     @property
     def sequence_seeds(self) -> range:
@@ -131,22 +152,31 @@ class Options:
     """Print results.json instead of the table."""
 
 
-def policy_infos(settings: Settings) -> list[PolicyInfo]:
-    """The table's policies, then the sweeps of their families."""
-    listed = [parse_policy(name) for name in (*ENDPOINTS, *settings.policies)]
-    families = dict.fromkeys(family for family, _ in listed)
-    swept = [(family, float(value)) for family in families for value in FAMILIES[family].sweep]
-    chosen = dict.fromkeys([*listed, *(swept if settings.sweep else [])])
+def policy_infos(names: Sequence[str], sweep: bool = True, every: int = 1) -> list[PolicyInfo]:
+    """The table's policies, never and always first, then the sweeps of their families.
+
+    Args:
+        names: of the table's policies.
+        sweep: whether the families' sweeps take part.
+        every: of the sweeps of adaptive families only every so many-th number.
+    """
+    listed = [parse_policy(name) for name in (*ENDPOINTS, *names)]
+    swept = [
+        PolicyName(family, float(value), weights)
+        for family, weights in dict.fromkeys((name.family, name.weights) for name in listed)
+        for value in FAMILIES[family].sweep[:: every if FAMILIES[family].adaptive else 1]
+    ]
     return [
         PolicyInfo(
-            name=policy_name(family, parameter),
-            family=family,
-            parameter=parameter,
-            listed=(family, parameter) in listed,
-            adaptive=FAMILIES[family].adaptive,
-            privileged=make_policy(policy_name(family, parameter), seed=0).privileged,
+            name=str(name),
+            family=name.family,
+            parameter=name.parameter,
+            listed=name in listed,
+            adaptive=FAMILIES[name.family].adaptive,
+            privileged=make_policy(str(name), seed=0).privileged,
+            weights=name.weights,
         )
-        for family, parameter in chosen
+        for name in dict.fromkeys([*listed, *(swept if sweep else [])])
     ]
 
 
@@ -164,7 +194,8 @@ class CompareSequence:
         first = seed == settings.sequence_seeds[0]
         trace = trace_sequence(stream, extrapolator, seed, keep_frames=first)
         stream.close()
-        policies = {info.name: make_policy(info.name, seed) for info in policy_infos(settings)}
+        scheduler = Scheduler(trace)
+        policies = {info.name: scheduler.scripted(make_policy(info.name, seed)) for info in settings.infos}
         energy = EnergyModel(lidar_frame_j=settings.config.lidar.energy_mj / 1000)
         return evaluate_sequence(trace, policies, least_errors, energy)
 
@@ -191,7 +222,10 @@ def run(options: Options) -> dict[str, Any]:
             progress=bar.update,
         )
     comparison = compare(
-        asdict(settings), policy_infos(settings), results, np.random.default_rng(settings.seed)
+        asdict(settings),
+        settings.infos,
+        results,
+        np.random.default_rng(settings.seed),
     )
     written = write_report(comparison, options.out)
     if options.json:

@@ -203,15 +203,15 @@ class Plan:
         return Step(f"record-{split}", (*command.split(), "--out", str(self.data[split]), *more))
 
     def _pair_options(self) -> tuple[str, ...]:
-        folders = {"train": self.data["train"], "validation": self.data["val"]}
+        folders = {"data": self.data["train"], "validation": self.data["val"]}
         folders["pairs"] = self.options.out / "pairs"
-        given = [part for name, path in folders.items() for part in (f"--data.{name}", str(path))]
-        return (*given, "--data.workers", str(self.options.jobs))
+        given = [part for name, path in folders.items() for part in (f"--{name}", str(path))]
+        return (*given, "--workers", str(self.options.jobs))
 
     def _train(self, network: Network, seed: int) -> Step:
         data: tuple[str, ...] = self._pair_options()
         if network.train[0] == KEYFRAME:
-            data = ("--recordings", str(self.data["train"]), "--validation", str(self.data["val"]))
+            data = ("--data", str(self.data["train"]), "--validation", str(self.data["val"]))
         device = [part for option in network.device_options for part in (option, self.options.device)]
         out = str(self.trained(network, seed).parent)
         numbered = [part for option in network.seed_options for part in (option, str(seed))]

@@ -1,4 +1,4 @@
-"""Train a keyframe detector on recordings, calibrate its thresholds, and write its weights with a card.
+"""Train a keyframe detector, calibrate its thresholds, and write its weights with a card.
 
 python scripts/train_keyframe.py RECIPE, one of
 
@@ -6,15 +6,18 @@ python scripts/train_keyframe.py RECIPE, one of
   temporal  the detector with a memory of past frames
   paper     the paper's network and recipe as released
 
-Recordings come from scripts/record.py. Killed at any time, the same command with --resume goes on.
+Recordings come from scripts/record.py. --data may also be a folder with ELiDAR's files: "cnn" and "paper"
+learn from the slicing HDF5, the second half of "temporal" from the raw sequences. Killed at any time, the
+same command with --resume goes on.
 """
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,9 @@ from torch import nn
 from tqdm import tqdm
 
 import nl_env
-from agents.keyframe_data import Slices, build_slices
+from agents.elidar_frames import open_elidar_frames, open_elidar_sequences
+from agents.keyframe_cnn import TEMPORAL_WEIGHTS
+from agents.keyframe_data import FrameSource, Slices, build_slices
 from agents.keyframe_networks import ARCHITECTURES, Detector, Perception, Recall, TemporalDetector
 from agents.keyframe_training import (
     KeyframeTask,
@@ -38,11 +43,13 @@ from agents.keyframe_training import (
     detect,
 )
 from nl_env.classification import summarise_detector
+from nl_env.elidar import elidar_in
 from nl_env.evaluation import resample_sequences
 from nl_env.training import Task, TrainingOptions, seeded, train
 from nl_env.training.run import BEST
 from nl_env.weight_files import Card, load_network, load_strictly, read_tensors, write_card, write_weights
 
+TEMPORAL = "keyframe-cnn-temporal"
 MEMORY_SAMPLING = SampleOptions(window=250, stride=25, new_weight=1.0)
 MEMORY_TRAINING = TrainingOptions(
     steps=300,
@@ -74,10 +81,14 @@ class Options:
     """Which windows of slices its second half learns from."""
     memory_training: TrainingOptions = MEMORY_TRAINING
     """How its second half learns to remember."""
-    recordings: Path = Path("runs/data/train")
-    """Recordings to learn from."""
+    data: Path = Path("runs/data/train")
+    """Recordings to learn from, or a folder with ELiDAR's files."""
     validation: Path = Path("runs/data/val")
-    """Recordings that choose the best weights and the thresholds."""
+    """Recordings that choose the best weights and the thresholds. Of ELiDAR, frames are held out instead."""
+    held_out: float = 0.1
+    """ELiDAR only: share of the training frames or sequences that is held out."""
+    first_half: Path = TEMPORAL_WEIGHTS
+    """ELiDAR only: a detector with a memory whose first half is kept, as ELiDAR has no maps of actors."""
     workers: int = 1
     """Processes that cut slices out of the recordings, once."""
     out: Path = Path("runs/keyframe")
@@ -113,7 +124,7 @@ RECIPES: dict[str, tuple[str, Options]] = {
     "temporal": (
         "The detector with a memory of past frames.",
         Options(
-            architecture="keyframe-cnn-temporal",
+            architecture=TEMPORAL,
             network={},
             sampling=SampleOptions(),
             training=TrainingOptions(
@@ -161,25 +172,31 @@ def slices_of(recordings: Path, workers: int) -> Slices:
         return build_slices(recordings, folder, workers=workers, progress=bar.update)
 
 
+def data_of(options: Options) -> tuple[FrameSource, FrameSource]:
+    """What is learnt from, and what is judged by."""
+    files = elidar_in(options.data)
+    if files is None:
+        return slices_of(options.data, options.workers), slices_of(options.validation, options.workers)
+    if options.architecture == TEMPORAL:
+        return open_elidar_sequences(files, options.held_out)
+    return open_elidar_frames(files.require_slicing(), options.held_out)
+
+
 def run(options: Options) -> Card:
     """Train, calibrate, and complete the card beside the weights."""
-    training = slices_of(options.recordings, options.workers)
-    validation = slices_of(options.validation, options.workers)
-    height, width = training.shape
-    arguments = {"height": height, "width": width, **options.network}
+    training, validation = data_of(options)
+    network, arguments = network_of(options, training)
     card = Card(
         what="Trigger policy: probability that a 20 ms event frame is a keyframe",
         architecture=options.architecture,
         options=arguments,
-        data={"training": described(training), "validation": described(validation)},
+        data={"training": training.summary, "validation": validation.summary},
         training={
             "command": shlex.join(["python", "scripts/train_keyframe.py", *sys.argv[1:]]),
             "sampling": asdict(options.sampling),
             "nl_env": nl_env.__version__,
         },
     )
-    with seeded(options.training.seed):
-        network = ARCHITECTURES[options.architecture](**arguments)
     if isinstance(network, TemporalDetector):
         return train_temporal(network, training, validation, options, card)
     task = KeyframeTask(training, validation, options.sampling)
@@ -189,29 +206,51 @@ def run(options: Options) -> Card:
     return calibrated(result.weights, validation, options.training.threads)
 
 
+def network_of(options: Options, training: FrameSource) -> tuple[nn.Module, dict[str, Any]]:
+    """The network to train and its arguments.
+
+    Without maps of actors a detector with a memory keeps a first half that was trained before.
+    """
+    if options.architecture == TEMPORAL and not isinstance(training, Slices):
+        network, card = load_network(options.first_half, ARCHITECTURES)
+        if not isinstance(network, TemporalDetector):
+            raise ValueError(
+                f"first_half: found {card.architecture} in {options.first_half}, expected {TEMPORAL}"
+            )
+        return network, card.options
+    height, width = training.shape
+    arguments = {"height": height, "width": width, **options.network}
+    with seeded(options.training.seed):
+        return ARCHITECTURES[options.architecture](**arguments), arguments
+
+
 def train_temporal(
-    network: TemporalDetector, training: Slices, validation: Slices, options: Options, card: Card
+    network: TemporalDetector,
+    training: FrameSource,
+    validation: FrameSource,
+    options: Options,
+    card: Card,
 ) -> Card:
-    """Train the two halves one after the other, in folders of their own, and put them together."""
-    halves: tuple[tuple[str, nn.Module], ...] = (
-        ("perception", Perception(network)),
-        ("recall", Recall(network)),
-    )
+    """Train the two halves one after the other, in folders of their own, and put them together.
+
+    The first needs the maps of actors that recordings have; on other data the second is trained alone.
+    """
+    halves: list[tuple[str, nn.Module, Callable[[], Task], TrainingOptions]] = []
+    if isinstance(training, Slices) and isinstance(validation, Slices):
+        see = partial(PerceptionTask, training, validation, options.sampling)
+        halves.append(("perception", Perception(network), see, options.training))
+    remember = partial(RecallTask, network, training, validation, options.memory_sampling)
+    halves.append(("recall", Recall(network), remember, options.memory_training))
     cards = {}
-    for name, half in halves:
-        task: Task
-        if name == "perception":
-            task = PerceptionTask(training, validation, options.sampling)
-            how = options.training
-        else:
-            task = RecallTask(network, training, validation, options.memory_sampling)
-            how = options.memory_training
+    for name, half, task, how in halves:
         part = replace(card, architecture=f"{options.architecture}/{name}")
         result = train(
-            half, task, how, options.out / name, part, resume=options.resume, overwrite=options.overwrite
+            half, task(), how, options.out / name, part, resume=options.resume, overwrite=options.overwrite
         )
         load_strictly(half, read_tensors(result.weights), result.weights)
         cards[name] = result.card
+    if "perception" not in cards:
+        card = replace(card, training={**card.training, "first_half": str(options.first_half)})
     whole = replace(
         card,
         training={**card.training, **{name: made.training for name, made in cards.items()}},
@@ -222,7 +261,7 @@ def train_temporal(
     return calibrated(weights, validation, options.training.threads)
 
 
-def calibrated(weights: Path, validation: Slices, threads: int) -> Card:
+def calibrated(weights: Path, validation: FrameSource, threads: int) -> Card:
     """Choose thresholds on the validation sequences and add them and what they reach to the card."""
     network, card = load_network(weights, ARCHITECTURES)
     assert isinstance(network, Detector)
@@ -238,18 +277,6 @@ def calibrated(weights: Path, validation: Slices, threads: int) -> Card:
     card = replace(card, metrics=metrics)
     write_card(weights, card)
     return card
-
-
-def described(data: Slices) -> dict[str, Any]:
-    """What a card says of the data."""
-    identity = data.identity
-    return {
-        "split": identity["split"],
-        "sequences": len(data),
-        "slices": data.length,
-        "first_seed": data.seeds[0],
-        "manifest_sha256": identity["manifest_sha256"],
-    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

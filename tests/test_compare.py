@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents import Evenly
-from agents.catalogue import FAMILIES, make_policy, parse_policy, policy_name
+from agents.catalogue import FAMILIES, PolicyName, make_policy, parse_policy
 from scripts import compare
 
 SHORT = (
@@ -29,6 +29,7 @@ def test_one_command_writes_the_whole_report(finished):
         "table.md",
         "report.html",
         "error_vs_rate.png",
+        "frontier.png",
         "rate_vs_time.png",
         "rate_vs_speed.png",
         "settings.json",
@@ -38,6 +39,7 @@ def test_one_command_writes_the_whole_report(finished):
     listed = [policy["name"] for policy in found["policies"] if policy["listed"]]
     assert listed == ["never", "always", "periodic:2", "event-rate:0.15"]
     assert [sequence["seed"] for sequence in found["sequences"]] == [2_000_000_000 + i for i in range(3)]
+    assert {curve["family"] for curve in found["frontier"]} == {"oracle", "periodic", "event-rate"}
     always = found["policies"][1]
     assert always["recall"]["mean"] in (1.0, None)
     assert always["rate"]["mean"] == pytest.approx(50.0)
@@ -106,12 +108,32 @@ def test_help_documents_every_option(capsys):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_and_its_sweep_can_be_made(family):
-    for value in FAMILIES[family].sweep:
-        name = policy_name(family, value)
-        assert parse_policy(name) == (family, value)
+    names = [PolicyName(family, value) for value in FAMILIES[family].sweep]
+    for name in names:
+        assert parse_policy(str(name)) == name
+    assert len({str(name) for name in names}) == len(names)
+    assert parse_policy(family).family == family
+    if FAMILIES[family].available:
+        for name in (family, *map(str, names)):
+            make_policy(name, seed=0)
+
+
+def test_names_of_schedules_keep_their_zeros_and_weights_their_path():
+    assert str(parse_policy("schedule:0010")) == "schedule:0010"
+    assert make_policy("schedule:0010", seed=0).pattern == "0010"
+    name = parse_policy("keyframe-cnn@runs/mine/best.safetensors:0.3")
+    assert name == ("keyframe-cnn", 0.3, "runs/mine/best.safetensors")
+    assert str(name) == "keyframe-cnn@runs/mine/best.safetensors:0.3"
+    with pytest.raises(ValueError, match="expected a path to weights after @, of a learned policy"):
+        parse_policy("periodic@runs/mine:2")
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        make_policy("keyframe-cnn@nothing.safetensors", seed=0)
+
+
+def test_the_default_rows_can_all_be_made():
+    for name in compare.Settings().policies:
         make_policy(name, seed=0)
-    assert parse_policy(family)[0] == family
-    make_policy(family, seed=0)
+    assert {"accumulated:0.5", "keyframe-cnn", "oracle:30"} <= set(compare.Settings().policies)
 
 
 @pytest.mark.parametrize("rate", [10, 17.5, 20, 30, 40, 41, 50])

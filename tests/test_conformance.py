@@ -15,7 +15,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from nl_env.observations import OBS_MODES
+from nl_env.observations import COST_MODES, OBS_MODES
 
 SEED = 3
 STEPS = 6
@@ -52,6 +52,17 @@ def test_sb3_check_env_without_a_warning(env_id, obs_mode):
     expected = INT8_WARNINGS if obs_mode == "signed" else ()
     assert len(messages) == len(expected), messages
     assert all(part in message for part, message in zip(expected, messages, strict=True))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("obs_mode", COST_MODES)
+def test_checkers_accept_a_cost_for_each_episode(env_id, obs_mode):
+    env = make(env_id, obs_mode=obs_mode, trigger_cost=(0.01, 1.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gymnasium_check(env.unwrapped, skip_render_check=True)
+        sb3_check(env.unwrapped)
+    env.close()
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -137,7 +148,10 @@ def test_resets_leave_handles_and_threads_flat(env_id):
 
 
 @pytest.mark.parametrize("env_id", IDS)
-@pytest.mark.parametrize(("policy", "obs_mode"), [("CnnPolicy", "image"), ("MultiInputPolicy", "dict")])
+@pytest.mark.parametrize(
+    ("policy", "obs_mode"),
+    [("CnnPolicy", "image"), ("MultiInputPolicy", "dict"), ("MlpPolicy", "statistics")],
+)
 def test_ppo_learns_on_it_as_it_is(env_id, policy, obs_mode):
     env = make(env_id, obs_mode=obs_mode, extrapolator="repeat")
     model = PPO(policy, env, n_steps=16, batch_size=16, n_epochs=1, device="cpu", seed=0)

@@ -159,6 +159,66 @@ def test_labelled_event_frames(tmp_path):
         SlicingData(path, "val")
 
 
+def write_slicing(path, **changes):
+    """Three labelled frames in either split; ``changes`` replace datasets of the training split."""
+    arrays = {"event_frames": np.ones((3, *SIZE), np.float32), "scores": np.array([0.0, 1.0, 1.0])}
+    with h5py.File(path, "w") as file:
+        for split, content in (("test", arrays), ("train", {**arrays, **changes})):
+            for name, array in content.items():
+                if array is not None:
+                    file.create_dataset(f"{split}/{name}", data=array)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"event_frames": None}, "train/event_frames: found nothing, expected a dataset"),
+        ({"scores": None}, "train/scores: found nothing, expected a dataset"),
+        ({"event_frames": np.ones((3, 48))}, r"found shape \(3, 48\), expected \(N, H, W\)"),
+        ({"event_frames": np.ones((3, 2, *SIZE))}, r"found shape \(3, 2, 6, 8\), expected \(N, H, W\)"),
+        ({"event_frames": np.zeros((3, *SIZE), "S2")}, r"found \|S2, expected numbers"),
+        ({"scores": np.zeros(4)}, r"scores: found shape \(4,\), expected \(3,\)"),
+        ({"scores": np.array([0, np.nan, 1])}, r"scores\[1\]: found nan, expected a label in \[0, 1\]"),
+        ({"scores": np.array([0, 1, -1])}, r"scores\[2\]: found -1.0, expected a label"),
+    ],
+)
+def test_labelled_frames_that_do_not_fit_are_refused(tmp_path, changes, message):
+    path = write_slicing(tmp_path / "slicing.h5", **changes)
+    assert len(SlicingData(path, "test")) == 3
+    with pytest.raises(ValueError, match=message):
+        SlicingData(path, "train")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_impossible_event_frames_are_refused_when_they_are_read(tmp_path, value):
+    frames = np.ones((3, *SIZE), np.float32)
+    frames[1, 2, 2] = value
+    data = SlicingData(write_slicing(tmp_path / "slicing.h5", event_frames=frames), "train")
+    data[0]
+    with pytest.raises(ValueError, match=r"train/event_frames\[1\]: found NaN or infinity"):
+        data.frames()[0:2]
+    with pytest.raises(IndexError, match="event frame: found 3, expected 0 to 2"):
+        data[3]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_slicing_file_is_refused(tmp_path, share):
+    path = write_slicing(tmp_path / "slicing.h5")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(ValueError, match=r"slicing\.h5: not a readable HDF5 file .*truncated"):
+        SlicingData(path, "train")
+
+
+def test_causes_are_told_where_the_label_follows_from_them(tmp_path):
+    raw = RawSequence(write_raw(tmp_path / "raw.npz"))
+    np.testing.assert_array_equal(raw.causes, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0]])
+    other = RawSequence(write_raw(tmp_path / "other.npz", key_frame=np.array([1, 1, 1, 0])))
+    np.testing.assert_array_equal(other.causes, [[1], [1], [1], [0]])
+    np.testing.assert_array_equal(raw.frames()[1:3], np.clip([raw.frame(1), raw.frame(2)], -128, 127))
+
+
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_raw_sequences_read_in_any_order(tmp_path, save):
     path = write_raw(tmp_path / "Town01_Opt_00.npz")

@@ -10,7 +10,16 @@ from nl_env import rewards
 from nl_env.config import SPLITS
 from nl_env.env import AdaptiveDepthEnv
 from nl_env.ledger import DepthLedger
-from nl_env.observations import OBS_MODES, event_frames, image_observation, signed_observation, state_vector
+from nl_env.observations import (
+    OBS_MODES,
+    cost_coordinate,
+    event_frames,
+    image_observation,
+    observation_space,
+    signed_observation,
+    state_vector,
+)
+from nl_env.statistics import ACTIVITY_FIELDS, ActivityMemory, slice_statistics
 from nl_env.types import SLICE_US, Extrapolation
 from nl_env.viewer import HEIGHT, WIDTH
 
@@ -173,6 +182,101 @@ def test_observation_encodings():
     assert state_vector(0.5, 0.25, 300, 100, 1).tolist() == [0.5, 0.25, 0.75, 1.0]
 
 
+def test_state_vectors_of_a_batch_equal_the_single_ones():
+    since_lidar, since_depth, last = np.array([0.2, 0.4]), np.array([0.2, 0.0]), np.array([0, 1])
+    batch = state_vector(since_lidar, since_depth, np.array([300, 7]), 100, last)
+    singles = [state_vector(0.2, 0.2, 300, 100, 0), state_vector(0.4, 0.0, 7, 100, 1)]
+    np.testing.assert_array_equal(batch, singles)
+
+
+def test_statistics_are_the_state_and_the_activity_since_the_depth_frames():
+    pictures, numbers = make(obs_mode="dict"), make(obs_mode="statistics")
+    (picture, _), (seen, _) = pictures.reset(seed=1), numbers.reset(seed=1)
+    memory, actions = ActivityMemory(), [0, 1, 0, 0, 1, 1, 0]
+    for action in actions:
+        memory.see(slice_statistics(picture["event_frame"][0]), pictures.sample.lidar is not None)
+        np.testing.assert_array_equal(seen[:4], picture["state"])
+        np.testing.assert_array_equal(seen[4:], memory.observed())
+        picture, _, _, _, info = pictures.step(action)
+        seen = numbers.step(action)[0]
+        memory.act(info["triggered"])
+    assert seen.shape == (4 + ACTIVITY_FIELDS,) and memory.windows.any(axis=1).all()
+
+
+def test_the_last_observation_shows_the_last_slice_after_its_action():
+    env = make(WallStream(slices=3), obs_mode="statistics")
+    env.reset(seed=1)
+    env.step(0)
+    before = env.step(0)[0]
+    after = env.step(1)[0]
+    _, since_depth, since_lidar, _ = after[4:].reshape(4, -1)
+    np.testing.assert_array_equal(after[4:].reshape(4, -1)[0], before[4:].reshape(4, -1)[0])
+    assert not since_depth.any() and since_lidar.any()
+
+
+def test_costs_are_drawn_for_each_episode_and_shown():
+    env, again = (make(obs_mode="statistics", trigger_cost=(0.01, 10.0)) for _ in range(2))
+    costs = []
+    for seed in (5, None, None, None):
+        observation, _ = env.reset(seed=seed)
+        np.testing.assert_array_equal(observation, again.reset(seed=seed)[0])
+        costs.append(env.trigger_cost)
+        assert observation in env.observation_space
+        assert observation[-1] == cost_coordinate(env.trigger_cost)
+        observation, _, _, _, info = env.step(1)
+        assert info["reward/trigger"] == -env.trigger_cost and observation[-1] == cost_coordinate(costs[-1])
+        again.step(1)
+    assert len(set(costs)) == 4 and all(0.01 <= cost <= 10.0 for cost in costs)
+
+
+def test_costs_are_uniform_in_the_logarithm():
+    env = make(WallStream(slices=1), obs_mode="dict", trigger_cost=(0.001, 10.0))
+    env.reset(seed=1)
+    logarithms = []
+    for _ in range(200):
+        observation, _ = env.reset()
+        logarithms.append(math.log10(env.trigger_cost))
+        assert observation["trigger_cost"] == cost_coordinate(env.trigger_cost)
+    counts = np.histogram(logarithms, bins=4, range=(-3, 1))[0]
+    assert counts.sum() == 200 and counts.min() > 25
+
+
+def test_a_reset_can_set_the_cost_of_its_episode():
+    for range_or_number in (0.1, (0.1, 1.0)):
+        env = make(obs_mode="dict", trigger_cost=range_or_number)
+        env.reset(seed=1, options={"trigger_cost": 20})
+        assert env.trigger_cost == 20.0 and env.step(1)[1] < -20
+        env.reset(seed=1)
+        assert 0.1 <= env.trigger_cost <= 1.0
+
+
+def test_the_cost_can_be_adapted_while_an_episode_runs():
+    env = make(trigger_cost=0.1)
+    env.reset(seed=1)
+    assert env.step(1)[4]["reward/trigger"] == -0.1
+    env.set_trigger_cost(0.4)
+    assert env.step(1)[4]["reward/trigger"] == -0.4
+    env.reset(seed=1)
+    assert env.trigger_cost == 0.4
+    with pytest.raises(ValueError, match="draws its cost"):
+        make(obs_mode="dict", trigger_cost=(0.1, 1.0)).set_trigger_cost(0.4)
+    with pytest.raises(ValueError, match="cost: found -1"):
+        env.set_trigger_cost(-1)
+
+
+def test_cost_coordinates_span_the_allowed_costs():
+    assert cost_coordinate(np.array([1e-4, 0.1, 100.0, 1e-9, 1e9])) == pytest.approx([0, 0.5, 1, 0, 1])
+    assert cost_coordinate(0.1).dtype == np.float32
+
+
+@pytest.mark.parametrize("mode", ["image", "signed"])
+def test_modes_without_a_place_for_the_cost_refuse_a_range(mode):
+    with pytest.raises(ValueError, match=f"trigger_cost: found a range of costs with obs_mode '{mode}'"):
+        make(obs_mode=mode, trigger_cost=(0.1, 1.0))
+    with pytest.raises(ValueError, match="trigger_cost"):
+        observation_space(mode, (48, 64), costs=True)
+
+
 @pytest.mark.parametrize("mode", OBS_MODES)
 def test_observations_fit_their_space_and_are_fresh(mode):
     env = make(obs_mode=mode)
@@ -293,6 +397,10 @@ def test_calls_out_of_order_say_what_to_do():
         ({"extrapolator": "magic"}, "warp"),
         ({"error_scale": 0.0}, "error_scale"),
         ({"trigger_cost": -1.0}, "trigger_cost"),
+        ({"trigger_cost": (0.1,), "obs_mode": "dict"}, "expected a number or a pair"),
+        ({"trigger_cost": (1.0, 0.1), "obs_mode": "dict"}, "lowest cost first"),
+        ({"trigger_cost": (0.0, 0.1), "obs_mode": "dict"}, r"trigger_cost: found 0.0, .* \[0.0001, 100"),
+        ({"trigger_cost": ("a", "b"), "obs_mode": "dict"}, "trigger_cost: found 'a'"),
     ],
 )
 def test_bad_arguments_list_the_valid_ones(arguments, message):
@@ -307,6 +415,10 @@ def test_unknown_arguments_and_options_are_refused():
         make().reset(options={"seed": 3})
     with pytest.raises(ValueError, match="sequence"):
         make().reset(options={"sequence": -3})
+    with pytest.raises(ValueError, match=r"options\['trigger_cost'\]: found -1"):
+        make().reset(options={"trigger_cost": -1})
+    with pytest.raises(ValueError, match=r"options\['trigger_cost'\]: found 1000"):
+        make(obs_mode="dict", trigger_cost=(0.1, 1.0)).reset(options={"trigger_cost": 1000})
 
 
 def test_rgb_array_is_a_panel_that_changes_and_depth_array_the_held_depth():

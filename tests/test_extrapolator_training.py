@@ -7,7 +7,7 @@ import pytest
 import torch
 from short_recordings import record
 
-from nl_env.depth.examples import Augmentation, augmented, example
+from nl_env.depth.examples import Augmentation, augmented
 from nl_env.depth.features import EVENTS
 from nl_env.depth.learned_networks import load_learned
 from nl_env.depth.motion import se3_log
@@ -52,7 +52,7 @@ def rng(seed=0):
 
 
 def test_examples_believe_in_the_last_interval_or_in_odometry(pairs):
-    believed, true = example(pairs, 3), example(pairs, 3, odometry=True)
+    believed, true = pairs.example(3), pairs.example(3, odometry=True)
     np.testing.assert_array_equal(true.motion, pairs[3]["true_motion"])
     np.testing.assert_array_equal(true.scene.last_motion, pairs[3]["true_last_motion"])
     expected = 2 * se3_log(np.array(pairs[3]["last_motion"]))  # 200 ms after 100 ms
@@ -61,8 +61,8 @@ def test_examples_believe_in_the_last_interval_or_in_odometry(pairs):
 
 
 def test_a_mirrored_example_is_the_mirror_image(pairs):
-    plain = augmented(example(pairs, 4), NONE, rng())
-    mirrored = augmented(example(pairs, 4), Augmentation(1, 0, 1, 0, 0), rng())
+    plain = augmented(pairs.example(4), NONE, rng())
+    mirrored = augmented(pairs.example(4), Augmentation(1, 0, 1, 0, 0), rng())
     np.testing.assert_array_equal(mirrored.truth, plain.truth[:, ::-1])
     a, b = plain.stack(), mirrored.stack()[:, :, ::-1]
     b[-3] *= -1  # flow to the right
@@ -72,8 +72,8 @@ def test_a_mirrored_example_is_the_mirror_image(pairs):
 
 def test_noise_changes_events_alone_and_follows_its_generator(pairs):
     noisy = Augmentation(flip=0, noise=0.05, threshold=1.5, start=0, jitter=0)
-    one, same, other = (augmented(example(pairs, 4), noisy, rng(seed)).stack() for seed in (1, 1, 2))
-    plain = example(pairs, 4).stack()
+    one, same, other = (augmented(pairs.example(4), noisy, rng(seed)).stack() for seed in (1, 1, 2))
+    plain = pairs.example(4).stack()
     assert one.tobytes() == same.tobytes() != other.tobytes()
     assert (one[EVENTS] != plain[EVENTS]).any()
     one[EVENTS] = plain[EVENTS]
@@ -81,7 +81,7 @@ def test_noise_changes_events_alone_and_follows_its_generator(pairs):
 
 
 def test_a_start_knows_no_motion(pairs):
-    started = augmented(example(pairs, 4), Augmentation(0, 0, 1, 1, 0), rng())
+    started = augmented(pairs.example(4), Augmentation(0, 0, 1, 1, 0), rng())
     assert started.scene.previous is None
     np.testing.assert_array_equal(started.motion, np.eye(4))
 
@@ -107,7 +107,7 @@ def test_the_refine_task_scores_an_untrained_network_as_the_warp_it_starts_from(
         ours = task.evaluate(network)
 
     def warped(index):
-        chosen = example(pairs, index, odometry=True)
+        chosen = pairs.example(index, odometry=True)
         depth = warp(chosen.scene.prior, pairs.camera, chosen.motion, pairs.max_depth)
         return depth, depth
 
@@ -137,15 +137,15 @@ def test_the_refine_loss_is_lowest_for_the_truth(pairs):
 
 def test_scores_want_every_gap(pairs):
     with pytest.raises(ValueError, match="every"):
-        scores(pairs, lambda index: (example(pairs, index).scene.prior,) * 2, every=5)
-    repeat = scores(pairs, lambda index: (example(pairs, index).scene.prior,) * 2)
+        scores(pairs, lambda index: (pairs.example(index).scene.prior,) * 2, every=5)
+    repeat = scores(pairs, lambda index: (pairs.example(index).scene.prior,) * 2)
     assert all(value == pytest.approx(1.0) for value in repeat.values())
 
 
 def test_the_paper_task_learns_from_what_the_paper_shows_its_network(pairs):
     task = PaperTask(pairs, pairs, NONE, PaperLoss("paper"))
     prior, voxel, truth = task.batch(np.array([4]), rng())
-    known = example(pairs, 4)
+    known = pairs.example(4)
     np.testing.assert_array_equal(prior[0, 0], known.scene.prior)
     np.testing.assert_array_equal(voxel[0], known.scene.voxel)
     np.testing.assert_array_equal(truth[0, 0], known.truth)
@@ -167,8 +167,8 @@ def test_bad_options_are_named():
 
 
 def command(folder, kind, out, *more):
-    data = [f"--data.{name}={folder / place}" for name, place in (("train", "train"), ("validation", "val"))]
-    return [kind, *data, f"--data.pairs={folder / 'pairs'}", "--data.instants=2", "--data.workers=0",
+    data = [f"--data={folder / 'train'}", f"--validation={folder / 'val'}", f"--pairs={folder / 'pairs'}"]
+    return [kind, *data, "--instants=2", "--workers=0",
             f"--out={out}", "--judge-every=1", *more]  # fmt: skip
 
 

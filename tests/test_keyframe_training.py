@@ -118,7 +118,7 @@ def test_building_again_only_opens_and_other_recordings_are_refused(recordings, 
     (changed / "manifest.json").write_text(json.dumps({**manifest, "note": "other"}))
     with pytest.raises(ValueError, match="manifest_sha256"):
         build_slices(changed, folder)
-    with pytest.raises(FileNotFoundError, match=r"no manifest\.json"):
+    with pytest.raises(FileNotFoundError, match=r"manifest\.json"):
         build_slices(tmp_path, tmp_path / "other")
 
 
@@ -297,7 +297,7 @@ def test_the_script_trains_calibrates_and_resumes(tmp_path, recipe, capsys):
     made_up(tmp_path / "train")
     made_up(tmp_path / "val", seed=9)
     script = training_script()
-    command = f"{recipe} --recordings {tmp_path}/train --validation {tmp_path}/val --out {tmp_path}/out"
+    command = f"{recipe} --data {tmp_path}/train --validation {tmp_path}/val --out {tmp_path}/out"
     options = (
         "--training.steps 2 --training.batch-size 4 --memory-training.steps 2 --memory-sampling.window 9"
     )

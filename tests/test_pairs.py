@@ -75,6 +75,10 @@ def test_they_pickle_as_a_path(pairs):
 def test_bad_input_is_named(recordings, pairs, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"manifest\.json"):
         build_pairs(tmp_path, tmp_path / "out", OPTIONS)
+    for content in ("[]", '{"split": "train"}', "{"):
+        (tmp_path / "manifest.json").write_text(content)
+        with pytest.raises(ValueError, match=r"found no manifest of recordings in .*manifest\.json"):
+            build_pairs(tmp_path, tmp_path / "out", OPTIONS)
     with pytest.raises(FileNotFoundError, match=r"settings\.json"):
         Pairs(tmp_path)
     with pytest.raises(IndexError, match="18"):

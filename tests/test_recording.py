@@ -15,7 +15,7 @@ from nl_env.env import AdaptiveDepthEnv
 from nl_env.keyframes import label_keyframe
 from nl_env.recording import Recording, record_sequence
 from nl_env.recording.schema import Header
-from nl_env.recording.writer import _Output
+from nl_env.recording.writer import CheckedOutput
 from nl_env.recording_stream import RecordingStream
 from nl_env.representations import voxel_from_bins, voxel_grid
 from nl_env.sensors.lidar import quantise
@@ -429,13 +429,13 @@ class TestWriting:
         assert sorted(path.name[0] for path in tmp_path.iterdir()) == [".", "1"]
 
     def test_ctrl_c_while_hdf5_writes(self, tmp_path, monkeypatch):
-        write = _Output.write
+        write = CheckedOutput.write
 
         def pressing(self, data):
             signal.raise_signal(signal.SIGINT)
             return write(self, data)
 
-        monkeypatch.setattr(_Output, "write", pressing)
+        monkeypatch.setattr(CheckedOutput, "write", pressing)
         # Where a shell began the tests with &, Ctrl-C is ignored.
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:

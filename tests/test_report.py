@@ -2,17 +2,25 @@ import json
 import re
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from test_evaluation import POLICIES, infos, results
+from test_evaluation import POLICIES, results
 
-from nl_env.comparison import compare
+from nl_env.comparison import PolicyInfo, compare
 from nl_env.depth.metrics import METRIC_NAMES
 from nl_env.report import write_report
 from nl_env.tables import text_report
+
+
+def infos():
+    return [
+        PolicyInfo(name, name.partition(":")[0], None, name != "random:0.4", True, name == "keyframe-rule")
+        for name in POLICIES
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +45,9 @@ def test_results_json_holds_every_number(comparison, folder):
         assert policy["held"]["log_mae"]["mean"] == summary.held["log_mae"].mean
         assert np.mean(policy["per_sequence"]["error"]) == pytest.approx(summary.held["log_mae"].mean)
         assert policy["rate"]["min"] <= policy["rate"]["mean"] <= policy["rate"]["max"]
+    assert found["frontier"][0]["family"] == "oracle"
+    assert {curve["family"]: curve["regret"]["mean"] for curve in found["frontier"]}["periodic"] == 1.0
+    assert found["rate_by_kind"]["scenario"]["always"]["rate"] == pytest.approx([50.0])
     assert found["policies"][0]["produced"]["log_mae"]["mean"] is None  # "never" produced nothing
     assert found["floor"]["rate"][0] == pytest.approx(10.0)
     assert np.all(np.diff(found["floor"]["rate"]) > 0)
@@ -46,7 +57,9 @@ def test_the_schema_document_names_every_field(folder):
     schema = Path(__file__).parents[1] / "docs" / "results-schema.md"
     documented = set(re.findall(r"`(\w+)`", schema.read_text(encoding="utf-8")))
     found = json.loads((folder / "results.json").read_text())
+    curve = found["frontier"][0]
     fields = {*found, *found["sequences"][0], *found["policies"][0], *METRIC_NAMES}
+    fields |= {*curve, *curve["matched"][0], *found["rate_by_kind"]["style"]["always"]}
     assert fields <= documented
 
 
@@ -57,10 +70,12 @@ def test_tables_show_the_same_numbers(comparison, folder):
     row = next(line for line in text if line.startswith("periodic:3"))
     assert f"{periodic:.4f}" in row.split()
     markdown = (folder / "table.md").read_text()
+    regret = comparison.frontier["random"].regret.mean
+    assert re.search(rf"\| random \| {regret:.3f} \|", markdown)
     assert re.search(rf"\| periodic:3 \|.*\| {periodic:.4f} \|", markdown)
 
 
-@pytest.mark.parametrize("name", ["error_vs_rate", "rate_vs_time", "rate_vs_speed"])
+@pytest.mark.parametrize("name", ["error_vs_rate", "frontier", "rate_vs_time", "rate_vs_speed"])
 def test_figures_are_drawn(folder, name):
     image = np.asarray(Image.open(folder / f"{name}.png").convert("RGB")).astype(int)
     assert image.shape[1] > 800
@@ -107,6 +122,18 @@ def browser(tmp_path):
         yield browser
 
 
+CLICK_POINT = """
+const [name, shiftKey] = arguments, svg = document.querySelector("#error-chart svg");
+const family = name.split(":")[0], policy = results.policies.find(p => p.name === name);
+const groups = [...document.querySelectorAll("#error-chart .legend button")].map(b => b.textContent);
+const group = svg.querySelectorAll("g")[groups.indexOf(family)];
+const box = group.querySelector("circle").getBoundingClientRect();
+svg.dispatchEvent(new MouseEvent("click", {
+  clientX: box.left + box.width / 2, clientY: box.top + box.height / 2, shiftKey, bubbles: true,
+}));
+"""
+
+
 def wait_for(browser, condition):
     deadline = time.monotonic() + 20
     while not browser.execute_script(f"return {condition}"):
@@ -133,15 +160,39 @@ def test_the_page_works_in_a_browser(folder, browser):
     browser.execute_script("const s = document.getElementById('policy-1'); s.value = 'always'; s.onchange()")
     assert "0 ms" in browser.find_element("id", "readout-1").text
 
+    # So does a click on a point of the frontier, also one that is not in the table; with shift it goes to A.
+    for name, shift, target in (("random:0.4", False, "policy-1"), ("periodic:3", True, "policy-0")):
+        browser.execute_script(CLICK_POINT, name, shift)
+        assert browser.execute_script(f"return document.getElementById('{target}').value") == name
+
     rows = browser.find_elements("css selector", "#table tbody tr")
-    assert [row.find_element("css selector", "td").text for row in rows] == list(POLICIES)
-    assert browser.find_elements("css selector", "#error-chart circle")
+    listed = [info.name + (" *" if info.privileged else "") for info in infos() if info.listed]
+    assert [row.find_element("css selector", "td").text for row in rows] == listed
+    families = browser.find_elements("css selector", "#regret-table tbody td:first-child")
+    assert [cell.text for cell in families] == ["oracle", "periodic", "random", "keyframe-rule"]
+    for view in browser.find_elements("css selector", "#views button"):
+        view.click()
+        assert browser.find_elements("css selector", "#error-chart circle")
+        assert not browser.execute_script(
+            "return document.querySelector('#error-chart').innerHTML.includes('NaN')"
+        )
     assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []
 
 
 def test_the_browser_would_report_a_broken_page(folder, browser, tmp_path):
-    page = (folder / "report.html").read_text().replace("drawHeader();\ndrawCharts();", "drawNothing();")
+    page = (folder / "report.html").read_text().replace("drawHeader();\ndrawRegrets();", "drawNothing();")
     broken = tmp_path / "broken.html"
     broken.write_text(page)
     browser.get(broken.as_uri())
     assert any(entry["level"] == "SEVERE" for entry in browser.get_log("browser"))
+
+
+def test_a_page_without_frames_has_no_player(comparison, browser, tmp_path):
+    sequences = tuple(replace(sequence, frames=None) for sequence in comparison.sequences)
+    write_report(replace(comparison, sequences=sequences, shown=None), tmp_path)
+    assert not (tmp_path / "rate_vs_time.png").exists()
+    browser.get((tmp_path / "report.html").as_uri())
+    wait_for(browser, "document.body.dataset.ready === 'true'")
+    assert browser.find_elements("id", "player") == []
+    assert browser.find_elements("css selector", "#error-chart circle")
+    assert [entry for entry in browser.get_log("browser") if entry["level"] != "INFO"] == []

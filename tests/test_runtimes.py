@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import operator
 import pickle
 import platform
 import subprocess
@@ -16,6 +17,7 @@ from torch.nn import functional
 from nl_env.depth.runtime import NetworkRunner, compile_network, default_threads
 from nl_env.depth.runtime.onnx_file import OnnxNetwork, load_onnx
 from nl_env.depth.runtime.torch_cpu import limited_threads
+from nl_env.depth.runtime.torch_folding import folded, unfolded
 from nl_env.depth.runtime.tracing import traced
 
 RUNTIMES = ("torch", "openvino", "onnxruntime")
@@ -191,6 +193,58 @@ def test_tracing_folds_the_batch_norms_behind_convolutions(network):
     network.head.weight.data.zero_()
     for one, other in zip(module(*map(torch.from_numpy, images())), outputs, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+class Folding(nn.Module):
+    """A network that works on blocks of pixels, whose output is scaled, between full-resolution images."""
+
+    def __init__(self, factor):
+        super().__init__()
+        self.factor = factor
+        self.inner = nn.Conv2d(3 * factor**2, 8, 3, padding=1)
+        self.outer = nn.Conv2d(8, 2 * factor**2, 3, padding=1)
+
+    def forward(self, image):
+        x = functional.relu(self.inner(functional.pixel_unshuffle(image, self.factor)))
+        return functional.pixel_shuffle(0.1 * self.outer(x), self.factor) + image[:, :2]
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize(("factor", "width"), [(2, 48), (3, 57)])
+def test_blocks_of_pixels_become_channels_and_pixels_again(runtime, factor, width):
+    torch.manual_seed(0)
+    network = Folding(factor).eval()
+    image = np.random.default_rng(0).standard_normal((2, 3, 12, width)).astype(np.float32)
+    (found,), expected = compiled(network, (image,), runtime)(image), np.stack(eager(network, (image,)))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_folding_is_what_pytorch_does_with_the_channels_of_a_pixel_side_by_side(factor):
+    image = torch.randn(2, 3, 6 * factor, 19 * factor)
+    there = folded(image, factor)
+    assert torch.equal(there, functional.pixel_unshuffle(image, factor))
+    assert there.is_contiguous(memory_format=torch.channels_last)
+    back = unfolded(there, factor)
+    assert torch.equal(back, image) and back.is_contiguous()
+
+
+def test_tracing_folds_constant_factors_into_convolutions_that_nothing_else_reads():
+    class Scaled(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.first, self.second = nn.Conv2d(2, 4, 3), nn.Conv2d(4, 2, 1, bias=False)
+
+        def forward(self, x):
+            x = self.first(x)
+            return 0.5 * x + x, self.second(x) * 3
+
+    network, image = Scaled().eval(), torch.randn(1, 2, 8, 8)
+    module, outputs = traced(network, [image])
+    assert sum(node.target is operator.mul for node in module.graph.nodes) == 1
+    for one, other in zip(module(image), network(image), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    assert torch.equal(outputs[1], network(image)[1])
 
 
 def test_bf16_is_close_and_not_the_same(network):

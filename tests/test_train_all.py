@@ -65,9 +65,8 @@ def test_every_planned_command_is_understood_by_its_script(tmp_path, monkeypatch
 
     monkeypatch.setattr(record, "run", work)
     monkeypatch.setattr(train_keyframe, "run", work)
-    monkeypatch.setattr(train_extrapolator, "train_ours", work)
-    monkeypatch.setattr(train_extrapolator, "train_paper", work)
-    monkeypatch.setattr(train_extrapolator.Data, "open", lambda data: done.append(data) or ())
+    for command in ("PairsCommand", "Ours", "Paper"):
+        monkeypatch.setattr(getattr(train_extrapolator, command), "run", work)
     for table in ("TableKeyframe", "TableRates", "TableAblation", "TableEndToEnd"):
         monkeypatch.setattr(getattr(reproduce, table), "run", work)
     scripts = {

@@ -84,6 +84,22 @@ def test_a_post_moves_by_its_parallax_keeps_its_width_and_leaves_a_hole():
     assert (kept[:, hole] == prior[:, hole]).all() and (kept[hit] == warped[hit]).all()
 
 
+@pytest.mark.parametrize("width", [8, 63, 65, 150])
+def test_rows_of_any_length_are_moved_whole(width):
+    """Columns of different depths, so that mixing them up would show; the camera moves up by 3 pixels."""
+    camera = Camera.from_fov(24, width, 70.0)
+    columns = np.linspace(5, 60, width, dtype=np.float32)
+    motion = np.eye(4)
+    for k in (0, width // 2, width - 1):
+        motion[1, 3] = 3 * columns[k] / camera.fy
+        prior = np.zeros(camera.shape, np.float32)
+        prior[:, k] = columns[k]
+        warped, hit = splat(prior, camera, motion, RANGE)
+        np.testing.assert_allclose(warped[3:, k], columns[k], rtol=1e-6)
+        assert hit[3:, k].all() and not warped[:, :k].any() and not warped[:, k + 1 :].any()
+        assert warped[:3, k].max() == 0
+
+
 def test_the_nearer_surface_wins():
     prior = np.full(CAMERA.shape, 40, np.float32)
     prior[:, :32] = 10

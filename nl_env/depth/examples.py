@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.config import number
 from nl_env.depth.features import GAP_UNIT, Scene, features, hide_events
-from nl_env.depth.motion import continued, se3_exp
-from nl_env.depth.pairs import Pairs
+from nl_env.depth.motion import se3_exp
 from nl_env.depth.twist import SPREAD
-from nl_env.sensors.lidar import decode
+from nl_env.types import Camera
 
 _MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
@@ -46,7 +46,7 @@ class Example:
     Attributes:
         scene: what is known.
         motion: ``(4, 4)``, the motion over the gap as it is believed.
-        true_motion: ``(4, 4)``, as it was.
+        true_motion: ``(4, 4)``, as it was; NaN where that is not known.
         truth: ``(H, W)`` float32 m.
     """
 
@@ -61,27 +61,40 @@ class Example:
         return stack if events else hide_events(stack)
 
 
-def example(
-    pairs: Pairs, index: int, motion: NDArray[np.float64] | None = None, *, odometry: bool = False
-) -> Example:
-    """Pair ``index``.
+class PairSource(Protocol):
+    """Pairs as the trainings take them; ``len`` says how many.
 
-    Args:
-        pairs: where from.
-        index: which.
-        motion: believed motion over the gap; default the last interval's, continued.
-        odometry: believe the true motions instead, over the gap and over the last interval.
+    Attributes:
+        camera: intrinsics.
+        max_depth: sensor range, m.
+        gaps: how many different gaps, or groups of gaps, there are.
+        poses: whether the true motions are known.
     """
-    pair = pairs[index]
-    gap = int(pair["gap_us"])
-    last = np.array(pair["true_last_motion"] if odometry else pair["last_motion"])
-    if odometry:
-        motion = np.array(pair["true_motion"])
-    elif motion is None:
-        motion = continued(last, gap / pairs.lidar_period_us)
-    prior, previous, truth = (decode(pair[name], pairs.max_depth) for name in ("prior", "previous", "truth"))
-    scene = Scene(pairs.camera, pairs.max_depth, prior, previous, last, np.array(pair["voxel"]), gap * 1e-6)
-    return Example(scene, motion, np.array(pair["true_motion"]), truth)
+
+    camera: Camera
+    max_depth: float
+    gaps: int
+    poses: bool
+
+    def __len__(self) -> int: ...
+
+    def example(
+        self, index: int, motion: NDArray[np.float64] | None = None, *, odometry: bool = False
+    ) -> Example:
+        """Pair ``index``.
+
+        Args:
+            index: which.
+            motion: believed motion over the gap; default the last interval's, continued.
+            odometry: believe the true motions instead, over the gap and over the last interval; raises
+                ``ValueError`` where they are not known.
+        """
+        ...
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What they were made from, for cards: JSON-ready."""
+        ...
 
 
 def augmented(original: Example, options: Augmentation, rng: np.random.Generator) -> Example:

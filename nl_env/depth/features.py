@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from nl_env.depth.warp import splat
+from nl_env.depth.warp import z_buffer
 from nl_env.types import BINS, Camera
 
 CHANNELS = (
@@ -31,6 +31,8 @@ EVENTS = slice(CHANNELS.index("events 0"), CHANNELS.index("events 0") + BINS)
 """The channels of the voxel grid."""
 
 _FLOW = slice(CHANNELS.index("flow x"), CHANNELS.index("flow y") + 1)
+_DEPTHS = tuple(map(CHANNELS.index, ("warped log depth", "prior log depth", "previous against warped")))
+"""The channels that hold metres first, and then logarithms, which NumPy takes many at a time."""
 
 NEAREST = 1.0
 """Depths below are read as this one, m (as in the full-image metrics outdoors)."""
@@ -130,27 +132,27 @@ def features(scene: Scene, motion: NDArray[np.float64], *, compensated: bool = F
         raise ValueError(f"voxel: found shape {scene.voxel.shape}, expected {(BINS, *shape)}")
     if not scene.gap > 0:
         raise ValueError(f"gap: found {scene.gap!r} s, expected a positive time")
-    warped, hit = splat(scene.prior, scene.camera, motion, scene.max_depth)
+    warped = z_buffer(scene.prior, scene.camera, motion, scene.max_depth)
     if scene.previous is None:
-        older, older_hit = warped, np.zeros(shape, np.bool_)
+        older = np.full(shape, np.float32(-1))
     else:
-        older, older_hit = splat(scene.previous, scene.camera, motion @ scene.last_motion, scene.max_depth)
+        older = z_buffer(scene.previous, scene.camera, motion @ scene.last_motion, scene.max_depth)
     stack = np.empty((len(CHANNELS), *shape), np.float32)
     camera = scene.camera
-    _fill(
-        (np.ascontiguousarray(scene.prior), warped, hit, older, older_hit),
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-        np.linalg.inv(motion),
-        np.float32(scene.max_depth),
-        np.float32(math.log2(scene.gap / GAP_UNIT) / 2),
-        stack,
+    _fill_depths(np.ascontiguousarray(scene.prior), warped, older, np.float32(scene.max_depth), stack)
+    for channel in _DEPTHS:
+        np.log(stack[channel], out=stack[channel])
+    _fill_codes(stack)
+    _fill_flow(
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy]), np.linalg.inv(motion), stack[3], stack[_FLOW]
     )
-    _fill_events(
-        np.ascontiguousarray(scene.voxel, np.float32),
-        stack[_FLOW],
-        1.0 if compensated else 0.0,
-        stack[EVENTS],
-    )
+    np.arcsinh(stack[_FLOW], out=stack[_FLOW])
+    stack[_FLOW.stop :] = math.log2(scene.gap / GAP_UNIT) / 2
+    if compensated:
+        _carry_events(np.ascontiguousarray(scene.voxel, np.float32), stack[_FLOW], stack[EVENTS])
+    else:
+        stack[EVENTS] = scene.voxel
+    _compress(stack[EVENTS])
     return stack
 
 
@@ -160,73 +162,104 @@ def hide_events(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     return stack
 
 
-@njit(cache=True, error_model="numpy", inline="always")
-def _coded(depth, max_depth):  # type: ignore[no-untyped-def]
-    """Log depth code and whether there is a return."""
-    valid = (depth > np.float32(0)) & (depth < max_depth)
-    metres = max(depth, np.float32(NEAREST)) if valid else max_depth
-    code = (np.log(np.float32(metres)) - np.float32(LOG_CENTRE)) * np.float32(1 / LOG_SCALE)
-    return code, np.float32(1 if valid else 0)
+# The loops below go over few arrays each and have no branches: they run on vectors then.
 
 
 @njit(cache=True, error_model="numpy")
-def _fill(frames, intrinsics, back, max_depth, gap, stack):  # type: ignore[no-untyped-def]
-    """Write every channel but the events; ``back`` takes points of the present camera to the prior's."""
-    prior, warped, hit, older, older_hit = frames
+def _fill_depths(prior, warped, older, max_depth, stack):  # type: ignore[no-untyped-def]
+    """Every channel of depths, metres instead of logarithms; ``warped`` and ``older`` are z-buffers."""
     height, width = prior.shape
+    farthest = np.float32(1) / max_depth
+    for y in range(height):
+        _fill_metres(prior[y], max_depth, stack[4, y], stack[5, y])
+        found, own, depth, hit = warped[y], prior[y], stack[0, y], stack[2, y]
+        for x in range(width):
+            moved = np.float32(1) / found[x] if found[x] > farthest else np.float32(0)
+            depth[x] = moved if found[x] >= 0 else own[x]
+            hit[x] = np.float32(1 if found[x] >= 0 else 0)
+        _fill_metres(depth, max_depth, depth, stack[1, y])
+        metres, has_return, inverse = stack[0, y], stack[1, y], stack[3, y]
+        for x in range(width):
+            inverse[x] = np.float32(1) / metres[x] if has_return[x] > 0 else np.float32(0)
+        found, depth, hit = older[y], stack[6, y], stack[7, y]
+        for x in range(width):
+            depth[x] = np.float32(1) / found[x] if found[x] > farthest else np.float32(0)
+        _fill_metres(depth, max_depth, depth, hit)
+        for x in range(width):
+            hit[x] = np.float32(1 if found[x] >= 0 else 0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _fill_metres(depth, max_depth, metres, has_return):  # type: ignore[no-untyped-def]
+    """Depths that have a logarithm, no return being the range, and whether there is a return."""
+    for x in range(depth.size):
+        valid = (depth[x] > 0) & (depth[x] < max_depth)
+        has_return[x] = np.float32(1 if valid else 0)
+        metres[x] = max(depth[x], np.float32(NEAREST)) if valid else max_depth
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_codes(stack):  # type: ignore[no-untyped-def]
+    """Logarithms of depths to codes; that of the previous frame to what it differs by where it is hit."""
+    for y in range(stack.shape[1]):
+        warped, prior, older, hit = stack[0, y], stack[4, y], stack[6, y], stack[7, y]
+        for x in range(warped.size):
+            prior[x] = _code(prior[x])
+        for x in range(warped.size):
+            warped[x] = _code(warped[x])
+            older[x] = _code(older[x]) - warped[x] if hit[x] > 0 else np.float32(0)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _code(logarithm):  # type: ignore[no-untyped-def]
+    return (logarithm - np.float32(LOG_CENTRE)) * np.float32(1 / LOG_SCALE)
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_flow(intrinsics, back, inverse, flow):  # type: ignore[no-untyped-def]
+    """Where every pixel was in the prior: how far its surface moved, in pixels; then scale ``inverse``.
+
+    ``back`` takes points of the present camera to the prior's.
+    """
     fx, fy, cx, cy = intrinsics
+    _, height, width = flow.shape
+    rays_x = (np.arange(width) - cx) / fx
+    x0, x1, x2, x3 = back[0]
+    y0, y1, y2, y3 = back[1]
+    z0, z1, z2, z3 = back[2]
     for y in range(height):
         ray_y = (y - cy) / fy
+        near, flow_x, flow_y = inverse[y], flow[0, y], flow[1, y]
         for x in range(width):
-            ray_x = (x - cx) / fx
-            prior_code, prior_return = _coded(prior[y, x], max_depth)
-            code, has_return = prior_code, prior_return
-            depth = prior[y, x]
-            if hit[y, x]:
-                depth = warped[y, x]
-                code, has_return = _coded(depth, max_depth)
-            inverse = np.float32(1) / max(depth, np.float32(NEAREST)) if has_return > 0 else np.float32(0)
-            stack[0, y, x] = code
-            stack[1, y, x] = has_return
-            stack[2, y, x] = hit[y, x]
-            stack[3, y, x] = inverse * np.float32(INVERSE_SCALE)
-            stack[4, y, x] = prior_code
-            stack[5, y, x] = prior_return
-            if older_hit[y, x]:
-                stack[6, y, x] = _coded(older[y, x], max_depth)[0] - code
-                stack[7, y, x] = 1
-            else:
-                stack[6, y, x] = 0
-                stack[7, y, x] = 0
-            # Where this pixel was in the prior: how far its surface moved, in pixels.
-            px = back[0, 0] * ray_x + back[0, 1] * ray_y + back[0, 2] + inverse * back[0, 3]
-            py = back[1, 0] * ray_x + back[1, 1] * ray_y + back[1, 2] + inverse * back[1, 3]
-            pz = back[2, 0] * ray_x + back[2, 1] * ray_y + back[2, 2] + inverse * back[2, 3]
-            pz = max(pz, 0.1)
-            stack[8 + BINS, y, x] = np.arcsinh((ray_x - px / pz) * fx)
-            stack[9 + BINS, y, x] = np.arcsinh((ray_y - py / pz) * fy)
-            stack[10 + BINS, y, x] = gap
+            ray_x, w = rays_x[x], near[x]
+            px = x0 * ray_x + x1 * ray_y + x2 + w * x3
+            py = y0 * ray_x + y1 * ray_y + y2 + w * y3
+            pz = z0 * ray_x + z1 * ray_y + z2 + w * z3
+            away = 1.0 / max(pz, 0.1)
+            flow_x[x] = (ray_x - px * away) * fx
+            flow_y[x] = (ray_y - py * away) * fy
+            near[x] = w * np.float32(INVERSE_SCALE)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_events(voxel, flow, share, out):  # type: ignore[no-untyped-def]
-    """Compressed counts; each bin moved by ``share`` of the flow (asinh px) since its middle, bilinear."""
+def _carry_events(voxel, flow, out):  # type: ignore[no-untyped-def]
+    """Counts of each bin moved by the flow (asinh px) since its middle, bilinear."""
     bins, height, width = voxel.shape
     for k in range(bins):
-        back = share * (1 - (k + 0.5) / bins)
+        back = 1 - (k + 0.5) / bins
         for y in range(height):
             for x in range(width):
-                if back == 0:
-                    count = voxel[k, y, x]
-                else:
-                    column = x - back * math.sinh(flow[0, y, x])
-                    row = y - back * math.sinh(flow[1, y, x])
-                    count = _bilinear(voxel[k], column, row)
-                if count == 0:
-                    out[k, y, x] = 0
-                else:
-                    size = np.log1p(abs(count))
-                    out[k, y, x] = size if count > 0 else -size
+                column = x - back * math.sinh(flow[0, y, x])
+                row = y - back * math.sinh(flow[1, y, x])
+                out[k, y, x] = _bilinear(voxel[k], column, row)
+
+
+def _compress(counts: NDArray[np.float32]) -> None:
+    """``sign(n) log(1 + |n|)``, in place; bin by bin, which the caches hold."""
+    sizes = np.empty_like(counts[0])
+    for grid in counts:
+        np.log1p(np.abs(grid, out=sizes), out=sizes)
+        np.copysign(sizes, grid, out=grid)
 
 
 @njit(cache=True, error_model="numpy", inline="always")

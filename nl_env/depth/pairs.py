@@ -7,9 +7,7 @@ the last two LiDAR frames, which takes longer than everything else at training t
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.config import DrivingConfig, from_dict, number
-from nl_env.depth.features import coarse_camera
-from nl_env.depth.motion import estimate_motion
+from nl_env.depth.examples import Example
+from nl_env.depth.features import Scene
+from nl_env.depth.motion import continued, estimate_motion
 from nl_env.recording import Recording
+from nl_env.recording.cut_set import CutSet, cut
+from nl_env.recording.manifest import read_manifest
 from nl_env.representations import voxel_grid
-from nl_env.runs import SETTINGS_FILE, open_folder, run_sequences
 from nl_env.sensors.lidar import decode
 from nl_env.types import BINS, SLICE_US, Camera
-
-MANIFEST = "manifest.json"
-"""Beside the recordings: what there is, written when all of it is finished."""
 
 VERSION = 1
 """Changes with what is stored and with how the motion is estimated."""
@@ -135,8 +132,7 @@ def build_pairs(
         recordings: output of ``scripts/record.py``.
         folder: where the pairs go. One that holds these pairs already is only opened.
         options: which pairs.
-        workers: processes of one thread each; the files do not depend on it.
-        progress: called with the number of newly finished sequences.
+        workers, progress: as :func:`nl_env.recording.cut_set.cut`.
 
     Raises:
         FileNotFoundError: no manifest: nothing recorded there, or not finished.
@@ -144,68 +140,45 @@ def build_pairs(
         OSError: ``folder`` cannot be written.
     """
     options = options or PairOptions()
-    path = recordings / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"recordings: found no {MANIFEST} in {str(recordings)!r}; record.py writes it"
-        )
-    text = path.read_bytes()
-    manifest = json.loads(text)
-    seeds = [int(seed) for seed in manifest["seeds"]]
+    manifest = read_manifest(recordings)
     identity = {
         "version": VERSION,
-        "manifest_sha256": hashlib.sha256(text).hexdigest(),
-        "split": manifest["split"],
-        "seeds": seeds,
-        "config": manifest["config"],
+        "manifest_sha256": manifest.sha256,
+        "split": manifest.split,
+        "seeds": list(manifest.entries),
+        "config": manifest.content["config"],
         "pairs": asdict(options),
     }
-    files = {int(entry["seed"]): recordings / entry["file"] for entry in manifest["sequences"]}
-    checkpoints = open_folder(folder, identity, resume=True)
-    run_sequences(
-        _CutSequence(files, options),
-        _Cut.load,
-        seeds,
-        checkpoints,
-        workers=workers,
-        suffix=".npy",
-        progress=progress,
-    )
+    cut(folder, identity, _CutPairs(manifest.files, options), workers=workers, progress=progress)
     return Pairs(folder)
 
 
-class Pairs:
+class Pairs(CutSet):
     """The pairs that :func:`build_pairs` cut, read from disk as they are asked for.
 
-    Files are mapped at the first access, once per process; pickling carries the path alone.
-
-    Args:
-        folder: as given to :func:`build_pairs`.
-
-    Raises:
-        FileNotFoundError: ``folder`` holds no pairs.
-        ValueError: a file that is truncated or holds something else (at its first access).
+    A :class:`nl_env.depth.examples.PairSource`; errors as :class:`nl_env.recording.cut_set.CutSet`.
     """
 
+    what = "pairs"
+    poses = True
+
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
-        marker = self.folder / SETTINGS_FILE
-        if not marker.is_file():
-            raise FileNotFoundError(f"pairs: found no {SETTINGS_FILE} in {str(self.folder)!r}")
-        self.identity: dict[str, Any] = json.loads(marker.read_text(encoding="utf-8"))
+        super().__init__(folder)
         config = from_dict(DrivingConfig, self.identity["config"])
         self.camera, self.max_depth = config.camera, config.lidar.max_depth
-        self.coarse_camera = coarse_camera(self.camera)
-        self.seeds: list[int] = self.identity["seeds"]
         options = self.identity["pairs"]
+        self.gaps = len(options["gaps_ms"])
         self.lidar_period_us = 1000 * options["lidar_period_ms"]
-        self.per_sequence = options["instants"] * len(options["gaps_ms"])
-        self._files: dict[int, NDArray[np.void]] = {}
+        self.per_sequence = options["instants"] * self.gaps
 
     @property
     def summary(self) -> dict[str, Any]:
         """What they were cut from, for cards: JSON-ready."""
         return {**self.identity, "seeds": [self.seeds[0], self.seeds[-1]], "sequences": len(self.seeds)}
+
+    def expected(self, number: int) -> tuple[np.dtype[Any], tuple[int, ...]]:
+        """As many pairs in every sequence."""
+        return pair_dtype(self.camera), (self.per_sequence,)
 
     def __len__(self) -> int:
         return len(self.seeds) * self.per_sequence
@@ -215,57 +188,35 @@ class Pairs:
         if not 0 <= index < len(self):
             raise IndexError(f"pairs: found index {index}, expected 0 to {len(self) - 1}")
         sequence, row = divmod(int(index), self.per_sequence)
-        return self._sequence(sequence)[row]
+        return self.sequence(sequence)[row]
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"folder": self.folder}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["folder"])  # type: ignore[misc]
-
-    def _sequence(self, number: int) -> NDArray[np.void]:
-        if number not in self._files:
-            path = self.folder / "sequences" / f"{self.seeds[number]}.npy"
-            found = _Cut.load(path).pairs
-            expected = pair_dtype(self.camera)
-            if found.dtype != expected or found.shape != (self.per_sequence,):
-                raise ValueError(
-                    f"pairs: found {found.shape} of other contents in {str(path)!r}, "
-                    f"expected {(self.per_sequence,)} pairs of images {self.camera.shape}"
-                )
-            self._files[number] = found
-        return self._files[number]
-
-
-@dataclass(frozen=True)
-class _Cut:
-    """The pairs of one sequence and their file."""
-
-    pairs: NDArray[np.void]
-
-    def save(self, path: Path) -> None:
-        """Write uncompressed."""
-        np.save(path, self.pairs, allow_pickle=False)
-
-    @classmethod
-    def load(cls, path: Path) -> _Cut:
-        """Map what :meth:`save` wrote."""
-        try:
-            return cls(np.load(path, mmap_mode="r", allow_pickle=False))
-        except FileNotFoundError:
-            raise
-        except (ValueError, EOFError, OSError) as cause:
-            raise ValueError(f"pairs: found no whole array in {str(path)!r} ({cause})") from cause
+    def example(
+        self, index: int, motion: NDArray[np.float64] | None = None, *, odometry: bool = False
+    ) -> Example:
+        """As :meth:`nl_env.depth.examples.PairSource.example`."""
+        pair = self[index]
+        gap = int(pair["gap_us"])
+        last = np.array(pair["true_last_motion"] if odometry else pair["last_motion"])
+        if odometry:
+            motion = np.array(pair["true_motion"])
+        elif motion is None:
+            motion = continued(last, gap / self.lidar_period_us)
+        prior, previous, truth = (
+            decode(pair[name], self.max_depth) for name in ("prior", "previous", "truth")
+        )
+        voxel = np.array(pair["voxel"])
+        scene = Scene(self.camera, self.max_depth, prior, previous, last, voxel, gap * 1e-6)
+        return Example(scene, motion, np.array(pair["true_motion"]), truth)
 
 
 @dataclass(frozen=True)
-class _CutSequence:
+class _CutPairs:
     """The work of one process."""
 
-    files: dict[int, Path]
+    files: Mapping[int, Path]
     options: PairOptions
 
-    def __call__(self, seed: int) -> _Cut:
+    def __call__(self, seed: int) -> NDArray[np.void]:
         """Cut the pairs of the sequence of ``seed``."""
         with Recording(self.files[seed]) as recording:
-            return _Cut(cut_pairs(recording, self.options))
+            return cut_pairs(recording, self.options)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nl_env.config import choice
-from nl_env.depth.examples import Augmentation, augmented, example
+from nl_env.depth.examples import Augmentation, PairSource, augmented
 from nl_env.depth.losses import PAPER_WEIGHTS, RELEASED_WEIGHTS, meter_loss
 from nl_env.depth.metrics import returns_from_depth
-from nl_env.depth.pairs import Pairs
 from nl_env.depth.training import Prediction, scores
 from nl_env.training import Forward
 
@@ -47,8 +46,8 @@ class PaperTask:
 
     def __init__(
         self,
-        pairs: Pairs,
-        validation: Pairs,
+        pairs: PairSource,
+        validation: PairSource,
         augmentation: Augmentation,
         loss: PaperLoss | None = None,
         every: int = 1,
@@ -63,7 +62,7 @@ class PaperTask:
 
     def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.float32], ...]:
         """Prior ``(N, 1, H, W)`` m, voxel grid ``(N, 5, H, W)``, truth ``(N, 1, H, W)`` m."""
-        chosen = [augmented(example(self.pairs, int(index)), self.augmentation, rng) for index in indices]
+        chosen = [augmented(self.pairs.example(int(index)), self.augmentation, rng) for index in indices]
         return (
             np.stack([each.scene.prior[None] for each in chosen]),
             np.stack([each.scene.voxel.astype(np.float32, copy=False) for each in chosen]),
@@ -79,7 +78,7 @@ class PaperTask:
         """Every metric as a share of Repeat's; the best weights have the lowest RMSE, as in the paper."""
 
         def predict(index: int) -> Prediction:
-            scene = example(self.validation, index).scene
+            scene = self.validation.example(index).scene
             voxel = torch.from_numpy(scene.voxel.astype(np.float32))
             depth = model(torch.from_numpy(scene.prior)[None, None], voxel[None])[0, 0].numpy()
             return returns_from_depth(depth), depth

@@ -17,12 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nl_env.config import number
-from nl_env.depth.examples import Augmentation, Example, augmented, example
-from nl_env.depth.features import LOG_CENTRE, LOG_SCALE, NEAREST
+from nl_env.depth.examples import Augmentation, Example, PairSource, augmented
+from nl_env.depth.features import LOG_CENTRE, LOG_SCALE, NEAREST, coarse_camera
 from nl_env.depth.metrics import METRIC_NAMES, full_metrics, paper_metrics
 from nl_env.depth.motion import se3_log
 from nl_env.depth.motion_network import cell_inverse, flow_jacobian, solve_twist
-from nl_env.depth.pairs import Pairs
 from nl_env.depth.refine import RETURN, WARPED
 from nl_env.depth.refine_answer import depth_frames
 from nl_env.depth.twist import corrected, drift
@@ -53,8 +52,8 @@ class MotionTask:
 
     def __init__(
         self,
-        pairs: Pairs,
-        validation: Pairs,
+        pairs: PairSource,
+        validation: PairSource,
         augmentation: Augmentation | None = None,
         events: bool = True,
         every: int = 1,
@@ -70,7 +69,7 @@ class MotionTask:
     def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.float32], ...]:
         """Features ``(N, C, H, W)``, drifts ``(N, 5, h, w)``, corrections ``(N, 6)``, gaps ``(N,)`` s."""
         return self._arrays(
-            [augmented(example(self.pairs, int(index)), self.augmentation, rng) for index in indices]
+            [augmented(self.pairs.example(int(index)), self.augmentation, rng) for index in indices]
         )
 
     def loss(self, model: Forward, batch: tuple[Tensor, ...]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -84,7 +83,7 @@ class MotionTask:
         """Mean flow in pixels that the correction leaves over, and what it was before."""
         errors = []
         for index in range(0, len(self.validation), self.every):
-            batch = map(torch.from_numpy, self._arrays([example(self.validation, index)]))
+            batch = map(torch.from_numpy, self._arrays([self.validation.example(index)]))
             stack, drifts, twist, gap = batch
             both = self._errors(model(stack), stack, drifts, twist, gap)
             errors.append([error.item() for error in both])
@@ -111,20 +110,20 @@ class MotionTask:
         self, answer: Tensor, stack: Tensor, drifts: Tensor, twist: Tensor, gap: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Mean flow per image, px, that is left over, and without any correction."""
-        jacobian = flow_jacobian(self.pairs.coarse_camera, cell_inverse(stack))
+        jacobian = flow_jacobian(coarse_camera(self.pairs.camera), cell_inverse(stack))
         wanted = _flow(jacobian, twist)
         solved = _flow(jacobian, solve_twist(answer, drifts, jacobian, gap))
         return (wanted - solved).abs().sum(-1).mean((1, 2)), wanted.abs().sum(-1).mean((1, 2))
 
 
 def estimated_motions(
-    model: Callable[[Tensor], Tensor], pairs: Pairs, events: bool = True
+    model: Callable[[Tensor], Tensor], pairs: PairSource, events: bool = True
 ) -> NDArray[np.float64]:
     """The motion over the gap of every pair as the motion network has it, ``(len(pairs), 4, 4)``."""
     motions = np.empty((len(pairs), 4, 4))
     with torch.inference_mode():
         for index in range(len(pairs)):
-            chosen = example(pairs, index)
+            chosen = pairs.example(index)
             chosen = replace(chosen, scene=chosen.scene.coarse())
             stack = chosen.stack(events, compensated=True)
             answer = model(torch.from_numpy(stack)[None])[0].numpy()
@@ -201,8 +200,8 @@ class RefineTask:
 
     def __init__(
         self,
-        pairs: Pairs,
-        validation: Pairs,
+        pairs: PairSource,
+        validation: PairSource,
         motions: Motions | None = None,
         *,
         augmentation: Augmentation | None = None,
@@ -274,7 +273,7 @@ class RefineTask:
 
         def predict(index: int) -> Prediction:
             motion = None if self.motions is None else self.motions.validation[index]
-            chosen = self._unwarped(example(self.validation, index, motion, odometry=self.odometry))
+            chosen = self._unwarped(self.validation.example(index, motion, odometry=self.odometry))
             answer = model(torch.from_numpy(chosen.stack(self.events))[None])[0].numpy()
             return depth_frames(answer, self.validation.max_depth)
 
@@ -283,8 +282,8 @@ class RefineTask:
     def _training_example(self, index: int, draw: float) -> Example:
         true = self.odometry or draw < self.mix.true
         if self.motions is None or draw < self.mix.true + self.mix.continued:
-            return example(self.pairs, index, odometry=true)
-        return example(self.pairs, index, self.motions.training[index], odometry=true)
+            return self.pairs.example(index, odometry=true)
+        return self.pairs.example(index, self.motions.training[index], odometry=true)
 
     def _unwarped(self, chosen: Example) -> Example:
         return chosen if self.warped else standing(chosen)
@@ -295,7 +294,7 @@ def standing(chosen: Example) -> Example:
     return replace(chosen, scene=replace(chosen.scene, last_motion=np.eye(4)), motion=np.eye(4))
 
 
-def scores(pairs: Pairs, predict: Callable[[int], Prediction], every: int = 1) -> dict[str, float]:
+def scores(pairs: PairSource, predict: Callable[[int], Prediction], every: int = 1) -> dict[str, float]:
     """Errors of a method as shares of Repeat's, from means over the gaps.
 
     Args:
@@ -313,7 +312,7 @@ def scores(pairs: Pairs, predict: Callable[[int], Prediction], every: int = 1) -
     far = pairs.max_depth
     for index in range(0, len(pairs), every):
         depth, depth_if_return = predict(index)
-        known = example(pairs, index)
+        known = pairs.example(index)
         truth, prior = known.truth, known.scene.prior
         errors.setdefault(round(known.scene.gap * 1e6), []).append(
             [
@@ -321,14 +320,14 @@ def scores(pairs: Pairs, predict: Callable[[int], Prediction], every: int = 1) -
                 [*paper_metrics(prior, truth, far), *full_metrics(prior, truth, far)],
             ]
         )
-    groups = len(pairs.identity["pairs"]["gaps_ms"])
-    if len(errors) < groups:
+    if len(errors) < pairs.gaps:
         raise ValueError(
-            f"every: found {every}, which meets {len(errors)} of {groups} gaps only, "
-            f"expected a number that shares no factor with {groups}"
+            f"every: found {every}, which meets {len(errors)} of {pairs.gaps} gaps only, "
+            f"expected a number that shares no factor with {pairs.gaps}"
         )
     ours, repeat = np.mean([np.nanmean(np.array(rows), axis=0) for rows in errors.values()], axis=0)
-    shares = dict(zip(METRIC_NAMES, (ours / repeat).tolist(), strict=True))
+    with np.errstate(divide="ignore", invalid="ignore"):  # an error of zero has no share
+        shares = dict(zip(METRIC_NAMES, (ours / repeat).tolist(), strict=True))
     return {"score": float(np.mean([shares[name] for name in DECISIVE])), **shares}
 
 

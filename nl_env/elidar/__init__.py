@@ -3,11 +3,17 @@
 ``docs/data.md`` describes the files.
 """
 
-from nl_env.elidar.layout import ElidarFiles, find_files, parse_sequence_name, read_sequence_list
+from nl_env.elidar.layout import (
+    ElidarFiles,
+    elidar_in,
+    find_files,
+    parse_sequence_name,
+    read_sequence_list,
+)
 from nl_env.elidar.metadata import Metadata, Problem, SequencePairs, read_metadata
 from nl_env.elidar.pairs import ExtrapolationData, Pair
 from nl_env.elidar.slicing import RawSequence, SlicingData
-from nl_env.elidar.timeline import frame_ticks, rebuild_timelines
+from nl_env.elidar.timeline import frame_ticks, previous_frame, rebuild_timelines
 
 __all__ = [
     "ElidarFiles",
@@ -18,9 +24,11 @@ __all__ = [
     "RawSequence",
     "SequencePairs",
     "SlicingData",
+    "elidar_in",
     "find_files",
     "frame_ticks",
     "parse_sequence_name",
+    "previous_frame",
     "read_metadata",
     "read_sequence_list",
     "rebuild_timelines",

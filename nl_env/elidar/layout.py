@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 
 from nl_env.elidar.hdf5 import Hdf5Reader
+from nl_env.recording.manifest import MANIFEST
 from nl_env.recording.schema import SCHEMA
 from nl_env.types import TICK_US
 
@@ -235,6 +236,20 @@ def find_files(folder: Path) -> ElidarFiles:
             f"{SLICING_FILE} or {RAW_FOLDER}/*.npz"
         )
     return found
+
+
+def elidar_in(folder: Path) -> ElidarFiles | None:
+    """ELiDAR's files in ``folder``, or None where it has none or is a folder of recordings.
+
+    Raises:
+        ValueError: as :func:`find_files`.
+    """
+    if not folder.is_dir() or (folder / MANIFEST).is_file():
+        return None
+    try:
+        return find_files(folder)
+    except FileNotFoundError:
+        return None
 
 
 def _walk(folder: Path, depth: int) -> Iterable[Path]:

@@ -52,6 +52,7 @@ class ExtrapolationData:
             ``problems``; ``"raise"`` refuses them.
 
     Attributes:
+        metadata: the CSV.
         shape: ``(H, W)``.
         sequences: the rows of each sequence in use, by name.
         ticks: tick of each depth frame, by name (:func:`nl_env.elidar.timeline.frame_ticks`).
@@ -76,6 +77,7 @@ class ExtrapolationData:
         choice("on_error", on_error, ON_ERROR)
         number("max_depth", max_depth, 0.1, 10_000.0)
         self._reader = Hdf5Reader(hdf5)
+        self.metadata = metadata
         self.max_depth = float(max_depth)
         table = read_metadata(metadata, on_error=on_error)
         problems = list(table.problems)
@@ -109,12 +111,16 @@ class ExtrapolationData:
     def __len__(self) -> int:
         return int(self._starts[-1])
 
-    def __getitem__(self, index: int) -> Pair:
+    def place(self, index: int) -> tuple[str, int]:
+        """Sequence and row of pair ``index``; raises ``IndexError``."""
         if not 0 <= index < len(self):
             raise IndexError(f"pair: found {index}, expected 0 to {len(self) - 1}")
         place = int(np.searchsorted(self._starts, index, side="right")) - 1
-        name = self._names[place]
-        pairs, row = self.sequences[name], int(index - self._starts[place])
+        return self._names[place], int(index - self._starts[place])
+
+    def __getitem__(self, index: int) -> Pair:
+        name, row = self.place(index)
+        pairs = self.sequences[name]
         return Pair(
             name,
             self.depth(name, int(pairs.prior[row])),

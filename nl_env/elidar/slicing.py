@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,8 +13,39 @@ from numpy.typing import NDArray
 from nl_env.config import choice
 from nl_env.elidar.hdf5 import Hdf5Reader
 from nl_env.elidar.layout import RAW_ARRAYS, SPLITS
+from nl_env.keyframes import DISTANCE_LIMIT, SPEED_LIMIT
 
 INT16 = np.iinfo(np.int16)
+
+
+class EventFrames:
+    """Event frames that are read when a slice of them is asked for: ``frames[a:b]`` is ``(n, H, W)`` int8.
+
+    Args:
+        read: gives the frame ``(H, W)`` of an index.
+        chosen: ``(n,)`` the indices, in the order wanted.
+        shape: ``(H, W)``.
+        lowest: counts are cut to ``[lowest, 127]``.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[int], NDArray[Any]],
+        chosen: NDArray[np.int64],
+        shape: tuple[int, int],
+        lowest: int = -128,
+    ) -> None:
+        self._read, self._chosen, self._shape, self._lowest = read, chosen, shape, lowest
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, window: slice) -> NDArray[np.int8]:
+        chosen = self._chosen[window]
+        frames = np.empty((len(chosen), *self._shape), np.int8)
+        for frame, index in zip(frames, chosen.tolist(), strict=True):
+            frame[...] = np.clip(self._read(index), self._lowest, 127)
+        return frames
 
 
 class SlicingData:
@@ -63,6 +95,12 @@ class SlicingData:
         if not np.isfinite(frame).all():
             raise ValueError(f"{self.path}: {name}[{index}]: found NaN or infinity, expected event counts")
         return frame, float(self.scores[index])
+
+    def frames(self, chosen: NDArray[np.int64] | None = None, lowest: int = -128) -> EventFrames:
+        """The event frames ``chosen``, or all, to be read block by block."""
+        if chosen is None:
+            chosen = np.arange(len(self))
+        return EventFrames(lambda index: self[index][0], chosen, self.shape, lowest)
 
     @property
     def path(self) -> Path:
@@ -117,6 +155,22 @@ class RawSequence:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_archive": None, "_member": None}
+
+    @property
+    def causes(self) -> NDArray[np.bool_]:
+        """``(N, 3)``, the causes of the label: speed, distance, new.
+
+        ``(N, 1)``, the label alone, where it does not follow from them by the paper's rule.
+        """
+        causes = np.stack(
+            [self.ego_speed > SPEED_LIMIT, self.shortest_distance < DISTANCE_LIMIT, self.new_actors > 0],
+            axis=1,
+        )
+        return causes if np.array_equal(causes.any(axis=1), self.keyframe) else self.keyframe[:, None]
+
+    def frames(self) -> EventFrames:
+        """All event frames, to be read block by block."""
+        return EventFrames(self.frame, np.arange(len(self)), self.shape)
 
     def frame(self, index: int) -> NDArray[np.int16]:
         """Event frame of slice ``index``: ``(H, W)`` int16.

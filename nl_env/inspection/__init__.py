@@ -1,4 +1,4 @@
-"""What is in a file or folder: recordings, ELiDAR's files, or weights, and what is wrong with them."""
+"""What is in recordings, ELiDAR's files, event files or weights, and what is wrong with them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nl_env.elidar import find_files
 from nl_env.elidar.layout import HDF5_SUFFIXES, hdf5_kind
+from nl_env.importing import EVENT_SUFFIXES, cameras_in
 from nl_env.inspection.elidar import (
     inspect_elidar,
     inspect_lists,
@@ -14,6 +15,7 @@ from nl_env.inspection.elidar import (
     inspect_raw,
     inspect_slicing,
 )
+from nl_env.inspection.events import inspect_events
 from nl_env.inspection.findings import Findings, Reading
 from nl_env.inspection.native import inspect_recordings, inspect_weights
 
@@ -41,9 +43,11 @@ def inspect_path(path: Path, reading: Reading) -> list[Findings]:
         return [inspect_metadata(path)]
     if path.suffix == ".txt":
         return [inspect_lists({"sequences": path}, path)]
+    if cameras := cameras_in(path):
+        return [inspect_events(path, camera, reading) for camera in cameras]
     if path.suffix in HDF5_SUFFIXES:
         return list(_hdf5(path, reading))
-    known = ", ".join((*HDF5_SUFFIXES, ".npz", ".csv", ".txt", *WEIGHT_SUFFIXES))
+    known = ", ".join((*HDF5_SUFFIXES, *EVENT_SUFFIXES, ".npz", ".csv", ".txt", *WEIGHT_SUFFIXES))
     raise ValueError(f"{path}: found {path.suffix or 'no suffix'}, expected a folder or one of {known}")
 
 

@@ -56,9 +56,15 @@ def record_sequence(
     simulator = Simulator(config, seed)
     header = Header(seed, config, simulator.describe(), depth_period_us, intensity)
     try:
-        with replacing(Path(path)) as temporary, _Interrupts() as interrupts, _Output(temporary) as output:
+        with (
+            replacing(Path(path)) as temporary,
+            DeferredInterrupts() as interrupts,
+            CheckedOutput(temporary) as output,
+        ):
             with h5py.File(output, "w", libver=LIBVER) as file:
-                datasets = {name: _Dataset(file, name, column) for name, column in header.columns.items()}
+                datasets = {
+                    name: DatasetWriter(file, name, column) for name, column in header.columns.items()
+                }
                 for _ in _record(simulator, header, datasets):
                     output.check()
                     interrupts.check()
@@ -70,7 +76,7 @@ def record_sequence(
         raise OSError(f"{path}: cannot write the recording ({error})") from error
 
 
-class _Output(io.FileIO):
+class CheckedOutput(io.FileIO):
     """A file whose failures wait for :meth:`check`: HDF5 ends the process after a write that failed."""
 
     def __init__(self, path: Path) -> None:
@@ -103,14 +109,14 @@ class _Output(io.FileIO):
             raise self._error
 
 
-class _Interrupts:
+class DeferredInterrupts:
     """Ctrl-C waits for :meth:`check`, because HDF5 calls back into Python, which must not raise there."""
 
     def __init__(self) -> None:
         self._pending = False
         self._previous: Callable[[int, Any], Any] | None = None
 
-    def __enter__(self) -> _Interrupts:
+    def __enter__(self) -> DeferredInterrupts:
         previous = signal.getsignal(signal.SIGINT)
         if callable(previous) and threading.current_thread() is threading.main_thread():
             self._previous = previous
@@ -133,7 +139,7 @@ class _Interrupts:
         self._pending = True
 
 
-class _Dataset:
+class DatasetWriter:
     """One dataset that grows by whole chunks, so that each is compressed once.
 
     Rows wait in memory for a batch of about ``BATCH_BYTES``, or one chunk where that is larger.
@@ -186,7 +192,7 @@ class _Dataset:
         self._rows_waiting -= rows
 
 
-def _record(simulator: Simulator, header: Header, datasets: dict[str, _Dataset]) -> Iterator[None]:
+def _record(simulator: Simulator, header: Header, datasets: dict[str, DatasetWriter]) -> Iterator[None]:
     """Run the sequence into the datasets; yields after every tick."""
     max_depth = header.config.lidar.max_depth
     events = 0
@@ -221,7 +227,7 @@ def _record(simulator: Simulator, header: Header, datasets: dict[str, _Dataset])
         simulator.tick(depth=(t + TICK_US) % header.depth_period_us == 0)
 
 
-def _record_state(state: EgoState, datasets: dict[str, _Dataset]) -> None:
+def _record_state(state: EgoState, datasets: dict[str, DatasetWriter]) -> None:
     label = label_keyframe(state)
     datasets["state/speed"].append([state.speed])
     datasets["state/shortest_distance"].append([state.shortest_distance])

@@ -1,4 +1,4 @@
-"""The recorded sequences that tables are measured on: a folder as ``scripts/record.py`` writes it."""
+"""The sequences that tables are measured on, as ``scripts/record.py`` writes them."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-MANIFEST = "manifest.json"
+from nl_env.recording.manifest import read_manifest
 
 
 @dataclass(frozen=True)
 class Sequences:
-    """Recordings of one folder.
+    """Sequences of one folder.
 
     Attributes:
         split: train, val or test.
-        files: recording of each sequence seed.
-        digest: SHA-256 over seeds and hashes of the recordings.
+        files: of each sequence seed.
+        digest: SHA-256 over what identifies the files.
         settings: how they were recorded.
     """
 
@@ -36,14 +36,12 @@ def find_sequences(folder: Path, most: int | None = None) -> Sequences:
         FileNotFoundError: no manifest (an unfinished folder has none), or a recording it lists is gone.
         ValueError: a manifest that cannot be understood, or fewer recordings than asked for.
     """
-    path = folder / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(f"data: found no {path}, expected a finished folder of scripts/record.py")
+    manifest = read_manifest(folder, "data")
+    path, content = manifest.path, manifest.content
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        entries = [(int(e["seed"]), str(e["file"]), str(e["sha256"])) for e in manifest["sequences"]]
-        settings = {name: manifest[name] for name in ("split", "resolution", "duration", "noise", "lidar_hz")}
-    except (ValueError, KeyError, TypeError) as error:
+        entries = [(seed, entry["file"], str(entry["sha256"])) for seed, entry in manifest.entries.items()]
+        settings = {name: content[name] for name in ("resolution", "duration", "noise", "lidar_hz")}
+    except KeyError as error:
         raise ValueError(f"data: found no manifest of recordings in {path} ({error!r})") from error
     if most is not None and not 1 <= most <= len(entries):
         raise ValueError(f"sequences: found {most}, expected 1 to {len(entries)}, what {path} lists")
@@ -53,4 +51,4 @@ def find_sequences(folder: Path, most: int | None = None) -> Sequences:
         if not file.is_file():
             raise FileNotFoundError(f"data: found no {file}, which {path} lists")
     digest = hashlib.sha256(json.dumps([(seed, sha) for seed, _, sha in chosen]).encode()).hexdigest()
-    return Sequences(str(settings.pop("split")), files, digest, settings)
+    return Sequences(manifest.split, files, digest, settings)

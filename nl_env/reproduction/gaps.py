@@ -153,7 +153,7 @@ class GapsTask:
             errors = [
                 self._pair(recording, extrapolators, now, gaps) for now, gaps in self._times(recording, rng)
             ]
-            return SequenceErrors(seed, recording.description, _finite_mean(np.array(errors)))
+            return SequenceErrors(seed, recording.description, finite_mean(np.array(errors)))
 
     def _times(self, recording: Recording, rng: np.random.Generator) -> list[tuple[int, list[int]]]:
         """``(time of the LiDAR frame, gaps)`` of every pair, us; distinct frames while there are enough."""
@@ -210,7 +210,7 @@ def with_mean(errors: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([errors, mean], axis=-2)
 
 
-def _finite_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def finite_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean over the first axis without nan (an image of nothing but sky); nan where all are."""
     count = np.isfinite(values).sum(axis=0)
     total = np.where(np.isfinite(values), values, 0.0).sum(axis=0)

@@ -89,7 +89,7 @@ class KeyframeFigures:
     Attributes:
         splits: by split.
         weathers: test sequences by weather and by group of weathers.
-        cause_shares: by cause, its share of the test slices.
+        cause_shares: by cause, its share of the test slices; empty where causes are not known.
     """
 
     splits: Mapping[str, Group]
@@ -98,7 +98,10 @@ class KeyframeFigures:
 
 
 def summarise_keyframes(
-    splits: Mapping[str, Sequence[ScoredSequence]], detectors: Sequence[DetectorFile], seed: int
+    splits: Mapping[str, Sequence[ScoredSequence]],
+    detectors: Sequence[DetectorFile],
+    seed: int,
+    groups: Mapping[str, Sequence[str]] = WEATHER_GROUPS,
 ) -> KeyframeFigures:
     """Figures of every split, and of the weathers and causes of ``"test"``.
 
@@ -106,6 +109,7 @@ def summarise_keyframes(
         splits: sequences with one line of scores per detector.
         detectors: in that order.
         seed: draws the bootstrap.
+        groups: weathers that are also judged together.
 
     Raises:
         ValueError: no test split.
@@ -113,13 +117,16 @@ def summarise_keyframes(
     if "test" not in splits:
         raise ValueError(f"splits: found {', '.join(splits)}, expected test among them")
     test = splits["test"]
-    chosen = {name: (name,) for name in WEATHERS} | WEATHER_GROUPS
+    chosen = {name: (name,) for name in WEATHERS} | dict(groups)
     by_weather = {name: [s for s in test if s.weather in names] for name, names in chosen.items()}
-    causes = np.concatenate([sequence.causes for sequence in test])
+    known = all(sequence.causes.shape[1] == len(CAUSES) for sequence in test)
+    causes = np.concatenate([sequence.causes for sequence in test]) if known else None
     return KeyframeFigures(
         splits={name: _group(sequences, detectors, seed) for name, sequences in splits.items()},
         weathers={name: _group(s, detectors, seed) for name, s in by_weather.items() if s},
-        cause_shares={cause: float(causes[:, i].mean()) for i, cause in enumerate(CAUSES)},
+        cause_shares=(
+            {} if causes is None else {cause: float(causes[:, i].mean()) for i, cause in enumerate(CAUSES)}
+        ),
     )
 
 
@@ -159,12 +166,14 @@ def _over_seeds(estimates: Sequence[Estimate]) -> SeedEstimate:
 
 
 def keyframe_sections(found: KeyframeFigures) -> list[Section]:
-    """Tables for a document."""
-    return [
-        Section("Splits, beside the published table `keyframe_TrainTestAcc`", _splits(found), text=2),
-        Section("Test, by cause", _causes(found), text=2),
-        Section("Test, F1 by weather", _weathers(found)),
-    ]
+    """Tables for a document; none by cause or weather where these are not known."""
+    title = "Splits, beside the published table `keyframe_TrainTestAcc`"
+    sections = [Section(title, _splits(found), text=2)]
+    if found.cause_shares:
+        sections.append(Section("Test, by cause", _causes(found), text=2))
+    if found.weathers:
+        sections.append(Section("Test, F1 by weather", _weathers(found)))
+    return sections
 
 
 def _splits(found: KeyframeFigures) -> Rows:

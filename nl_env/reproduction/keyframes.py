@@ -18,8 +18,9 @@ from nl_env.representations import frame_from_bins
 OBSERVED = (-128, 127)
 """Event frames are clipped to what an observation holds."""
 
-Scorer = Callable[[NDArray[np.int16]], NDArray[np.floating]]
-"""Event frames ``(K, H, W)`` of one sequence, slice 1 first, to one score per slice."""
+Scorer = Callable[[Any], NDArray[np.floating]]
+"""Event frames ``(K, H, W)`` of one sequence, slice 1 first, to one score per slice; an array, or what
+gives arrays when it is sliced."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class ScoredSequence:
     Attributes:
         seed: of the sequence.
         weather: its name.
-        causes: ``(K, 3)`` bool, in the order of ``nl_env.classification.CAUSES``.
+        causes: ``(K, 3)`` bool, in the order of ``nl_env.classification.CAUSES``, or ``(K, 1)``, the label.
         lidar: ``(K,)`` bool, slices with a LiDAR frame.
         scores: ``(models, K)`` float64.
     """

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, fx, nn
 from torch.nn import functional
 
+from nl_env.depth.runtime.torch_folding import folded, replace_foldings
 from nl_env.depth.runtime.tracing import add_constant, constant, options, tidy, traced
 
 _RELUS = (functional.relu, torch.relu, "relu")
@@ -28,17 +29,22 @@ class TorchNetwork:
     """A traced and fused network; see :func:`nl_env.depth.runtime.compile_network`."""
 
     def __init__(self, network: nn.Module, examples: Sequence[NDArray[np.float32]], threads: int) -> None:
-        inputs = [_channels_last(torch.from_numpy(example)) for example in examples]
         with limited_threads(threads):
-            self._module, _ = traced(network, inputs)
+            self._module, _ = traced(network, [torch.from_numpy(example) for example in examples])
+            replace_foldings(self._module)
             if fusible():
                 fuse(self._module)
+        self._dense = [_is_folded(node) for node in self._module.graph.find_nodes(op="placeholder")]
         self._threads = threads
 
     def __call__(self, inputs: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
         with limited_threads(self._threads), torch.inference_mode():
-            outputs = self._module(*[_channels_last(torch.from_numpy(array)) for array in inputs])
-            return [output.numpy() for output in outputs]
+            tensors = [torch.from_numpy(array) for array in inputs]
+            placed = [
+                tensor if dense else _channels_last(tensor)
+                for tensor, dense in zip(tensors, self._dense, strict=True)
+            ]
+            return [output.numpy() for output in self._module(*placed)]
 
 
 @contextmanager
@@ -151,6 +157,11 @@ def _only_reader(node: fx.Node) -> fx.Node | None:
     """The node that alone reads this one."""
     readers = list(node.users)
     return readers[0] if len(readers) == 1 else None
+
+
+def _is_folded(node: fx.Node) -> bool:
+    """Whether the node is an image that is folded before any convolution sees it."""
+    return any(reader.target is folded for reader in node.users)
 
 
 def _pair(value: Any) -> list[int]:

@@ -1,7 +1,7 @@
 """A network as a flat list of tensor operations for one set of input shapes, batch norms folded.
 
-Every runtime starts from this form: shape checks and Python branches are gone, and so is the batch norm
-behind every convolution. The network given is never changed.
+Every runtime starts from this form: shape checks and Python branches are gone, and so are the batch norm
+and the constant factor behind every convolution. The network given is never changed.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ def traced(network: nn.Module, inputs: Sequence[Tensor]) -> tuple[fx.GraphModule
     values = tuple(tracer.values[node] for node in _returned(graph))
     graph_module = fx.GraphModule(tracer.constants, graph, type(network).__name__)
     fold_batch_norms(graph_module)
+    fold_factors(graph_module)
     return graph_module.eval(), values
 
 
@@ -195,6 +196,25 @@ def fold_batch_norms(graph_module: fx.GraphModule) -> None:
         folded["bias"] = add_constant(graph_module, conv, new_bias)
         conv.args = source, add_constant(graph_module, conv, new_weight), *folded.values()
         conv.kwargs = {}
+        node.replace_all_uses_with(conv)
+        graph_module.graph.erase_node(node)
+    tidy(graph_module)
+
+
+def fold_factors(graph_module: fx.GraphModule) -> None:
+    """Fold every number that a convolution, which nothing else reads, is multiplied by into its weights."""
+    for node in [node for node in graph_module.graph.nodes if node.target is operator.mul]:
+        factors = [factor for factor in node.args if isinstance(factor, (int, float))]
+        convolutions = [conv for conv in node.args if is_convolution(conv) and len(conv.users) == 1]
+        if len(factors) != 1 or len(convolutions) != 1:
+            continue
+        ((factor,), (conv,)) = factors, convolutions
+        source, weight = conv.args[:2]
+        scaled = options(conv)
+        bias = optional_constant(graph_module, scaled["bias"])
+        scaled["bias"] = None if bias is None else add_constant(graph_module, conv, factor * bias)
+        scaled_weight = add_constant(graph_module, conv, factor * constant(graph_module, weight))
+        conv.args, conv.kwargs = (source, scaled_weight, *scaled.values()), {}
         node.replace_all_uses_with(conv)
         graph_module.graph.erase_node(node)
     tidy(graph_module)

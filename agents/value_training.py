@@ -1,0 +1,344 @@
+"""Supervised training of :class:`agents.value_network.ValueNetwork` on enumerated decisions.
+
+Objectives:
+
+``"reduction"``
+    Regress the error that a trigger saves at this very slice, which is what the greedy oracle knows.
+``"advantage"``
+    Regress the least total of the rest of the interval when holding now, minus that when triggering now, both
+    followed by the best decisions in hindsight, at the given trigger cost.
+``"clone"``
+    Imitate the decision of the optimal oracle at the given trigger cost, in every state, also in those that
+    the oracle avoids.
+``"planned"``
+    Minimise the expected total error and cost of the interval when the network itself decides, with the
+    probability that its output gives. An interval has few states, so the expectation is summed exactly and
+    differentiated; nothing is sampled and nothing is looked up in hindsight.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents.decisions import Decisions, states
+from agents.value_network import ValueNetwork
+from nl_env.config import choice, number
+from nl_env.frontier import Curve, lower_hull
+from nl_env.observations import cost_coordinate
+
+OBJECTIVES = ("reduction", "advantage", "clone", "planned")
+VALIDATION_POINTS = 24
+"""Operating points of the curve by which checkpoints are chosen."""
+
+
+@dataclass(frozen=True)
+class ValueTraining:
+    """How a value network is trained."""
+
+    objective: str = "planned"
+    """reduction, advantage, clone or planned."""
+    hidden: tuple[int, ...] = (48, 24)
+    """Widths of the hidden layers."""
+    steps: int = 1200
+    """Optimiser steps."""
+    batch: int = 128
+    """LiDAR intervals per step; all states of each."""
+    learning_rate: float = 2e-3
+    """Peak, reached after a tenth of the steps; a cosine brings it down to 0."""
+    weight_decay: float = 1e-2
+    """AdamW's."""
+    dropout: float = 0.0
+    """Share of activity inputs that are replaced by their mean in training."""
+    cost_low: float = 1e-3
+    """Lowest trigger cost, in units of reward."""
+    cost_high: float = 3.0
+    """Highest trigger cost."""
+    error_scale: float = 0.05
+    """The log_mae that costs as much as a trigger of cost 1; as the environment's."""
+    evaluate_every: int = 100
+    """Steps between evaluations on the validation decisions; the best is kept."""
+    seed: int = 0
+    """Of the initial weights and of the batches."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` naming the option, what was found and what was expected."""
+        choice("objective", self.objective, OBJECTIVES)
+        number("steps", self.steps, 1, 10**7)
+        number("batch", self.batch, 1, 10**6)
+        number("learning_rate", self.learning_rate, 0.0, 1.0)
+        number("weight_decay", self.weight_decay, 0.0, 10.0)
+        number("dropout", self.dropout, 0.0, 0.9)
+        number("cost_low", self.cost_low, 1e-4, self.cost_high)
+        number("cost_high", self.cost_high, self.cost_low, 1e2)
+        number("error_scale", self.error_scale, 1e-9, 1e9)
+        number("evaluate_every", self.evaluate_every, 1, 10**7)
+
+    @property
+    def conditioned(self) -> bool:
+        """Whether the network is told the trigger cost."""
+        return self.objective != "reduction"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A network's curve on validation decisions.
+
+    Attributes:
+        step: of the training.
+        excess: mean over all frame rates of its error minus the oracle's.
+        curve: lower hull of its operating points and both ends.
+    """
+
+    step: int
+    excess: float
+    curve: Curve
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The best network of a training and how it got there."""
+
+    network: ValueNetwork
+    best: Evaluation
+    history: tuple[tuple[int, float, float], ...]
+    """``(step, mean loss since the last, excess)`` at every evaluation."""
+
+
+def train(
+    data: Decisions,
+    validation: Decisions,
+    options: ValueTraining,
+    progress: Callable[[int, float, float], None] = lambda step, loss, excess: None,
+) -> Trained:
+    """Train a network; of all evaluations the one with the least excess counts.
+
+    Same data and options, same weights, on one machine and with one thread.
+
+    Raises:
+        ValueError: bad options, or decisions of different LiDAR periods.
+    """
+    options.validate()
+    if data.period != validation.period:
+        raise ValueError(f"validation: found period {validation.period}, expected {data.period}")
+    rng = torch.Generator().manual_seed(options.seed)
+    observations, errors = _with_mirror(data)
+    network = _network(options, observations, errors, rng)
+    optimiser = torch.optim.AdamW(
+        network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
+    floor = oracle_curve(validation)
+    best: Evaluation | None = None
+    weights = network.state_dict()
+    history, losses = [], []
+    for step in range(1, options.steps + 1):
+        chosen = torch.randint(len(errors), (options.batch,), generator=rng)
+        costs = _draw_costs(options, rng)
+        loss = _loss(network, observations[chosen], errors[chosen], costs, options, rng)
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+        if step % options.evaluate_every == 0 or step == options.steps:
+            found = evaluate(network, validation, floor, step)
+            history.append((step, float(np.mean(losses)), found.excess))
+            progress(*history[-1])
+            losses = []
+            if best is None or found.excess < best.excess:
+                best, weights = found, copy.deepcopy(network.state_dict())
+    assert best is not None
+    network.load_state_dict(weights)
+    return Trained(network.eval(), best, tuple(history))
+
+
+def plan(errors: Tensor, price: Tensor, probabilities: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """What holding and triggering cost from every state on, to the end of the interval.
+
+    Args:
+        errors: ``(n, P, P)``, as :class:`agents.decisions.Decisions` has them.
+        price: ``(n,)`` error that a trigger costs.
+        probabilities: ``(n, states)`` of triggering, for what follows; None lets the best follow.
+
+    Returns:
+        ``(hold, trigger)``, ``(n, states)`` each; ``trigger`` includes its price.
+    """
+    period = errors.shape[1]
+    places = {place: i for i, place in enumerate(states(period))}
+    hold: list[Tensor] = [price] * len(places)
+    trigger: list[Tensor] = [price] * len(places)
+    after = [torch.zeros_like(price)] * period  # by offset of the frame that is held
+    for k in range(period - 1, 0, -1):
+        now = list(after)
+        for h in range(k):
+            i = places[k, h]
+            hold[i] = errors[:, k, h] + after[h]
+            trigger[i] = price + errors[:, k, k] + after[k]
+            if probabilities is None:
+                now[h] = torch.minimum(hold[i], trigger[i])
+            else:
+                now[h] = hold[i] + probabilities[:, i] * (trigger[i] - hold[i])
+        after = now
+    return torch.stack(hold, dim=1), torch.stack(trigger, dim=1)
+
+
+def play_out(
+    errors: NDArray[np.float64], triggers: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Total error over the offsets 1..P-1 and triggers, ``(n,)`` each, of decisions ``(n, states)``."""
+    period, rows = errors.shape[1], np.arange(len(errors))
+    first = np.array([k * (k - 1) // 2 for k in range(period)])  # the states of offset k follow each other
+    held = np.zeros(len(errors), np.int64)
+    total, count = np.zeros(len(errors)), np.zeros(len(errors), np.int64)
+    for k in range(1, period):
+        triggered = triggers[rows, first[k] + held]
+        held = np.where(triggered, k, held)
+        count += triggered
+        total += errors[rows, k, held]
+    return total, count
+
+
+def oracle_curve(decisions: Decisions) -> Curve:
+    """The least mean error at every mean number of triggers: the hull over prices of the best decisions."""
+    errors = torch.from_numpy(np.nan_to_num(decisions.errors))
+    points = []
+    for price in np.geomspace(1e-6, 1.0, 100):
+        hold, trigger = plan(errors, torch.full((len(errors),), price))
+        points.append(_mean_point(decisions, (trigger < hold).numpy()))
+    return _hull(decisions, points)
+
+
+def evaluate(network: ValueNetwork, decisions: Decisions, floor: Curve, step: int) -> Evaluation:
+    """Play ``decisions`` with a series of costs or thresholds and compare the curve with ``floor``."""
+    network.eval()
+    observations = torch.from_numpy(decisions.observations)
+    with torch.inference_mode():
+        if network.conditioned:
+            low, high = network.cost_range
+            chosen = [
+                network(_told(observations, torch.full((len(observations),), float(cost)))).numpy() > 0
+                for cost in np.geomspace(low, high, VALIDATION_POINTS)
+            ]
+        else:
+            scores = network(observations).numpy()
+            chosen = [scores > t for t in np.quantile(scores, np.linspace(0, 1, VALIDATION_POINTS))]
+    network.train()
+    curve = _hull(decisions, [_mean_point(decisions, triggers) for triggers in chosen])
+    low, high = float(floor.rate[0]), float(floor.rate[-1])
+    excess = (curve.area(low, high) - floor.area(low, high)) / (high - low)
+    return Evaluation(step, excess, curve)
+
+
+def _mean_point(decisions: Decisions, triggers: NDArray[np.bool_]) -> tuple[float, float]:
+    """Mean triggers per interval and mean error per slice."""
+    total, count = play_out(decisions.errors, triggers)
+    return float(count.mean()), float(total.mean()) / decisions.period
+
+
+def _hull(decisions: Decisions, points: list[tuple[float, float]]) -> Curve:
+    """Hull over triggers per interval of points and both ends."""
+    every = np.ones((len(decisions.errors), len(states(decisions.period))), bool)
+    ends = [_mean_point(decisions, ~every), _mean_point(decisions, every)]
+    triggers, errors = np.array([*points, *ends]).T
+    return lower_hull(triggers, errors)
+
+
+def _network(
+    options: ValueTraining, observations: Tensor, errors: Tensor, rng: torch.Generator
+) -> ValueNetwork:
+    """A fresh network that standardises its inputs; the draws come from ``rng`` alone."""
+    unit = 1.0
+    if not options.conditioned:
+        unit = float((_diagonal(errors)).std())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**62, (1,), generator=rng)))
+        network = ValueNetwork(
+            options.conditioned,
+            options.hidden,
+            unit,
+            (options.cost_low, options.cost_high) if options.conditioned else (),
+            options.error_scale,
+        )
+    flat = observations.reshape(-1, observations.shape[-1])
+    fields = flat.shape[-1]
+    network.mean[:fields] = flat.mean(dim=0)
+    network.scale[:fields] = 1 / flat.std(dim=0).clamp_min(1e-3)
+    if options.conditioned:
+        low, high = (float(cost_coordinate(cost)) for cost in (options.cost_low, options.cost_high))
+        network.mean[-1] = (low + high) / 2
+        network.scale[-1] = math.sqrt(12) / max(high - low, 1e-3)
+    return network
+
+
+def _with_mirror(data: Decisions) -> tuple[Tensor, Tensor]:
+    """Observations and errors, every drive also seen in a mirror."""
+    both = [data, data.mirrored()]
+    observations = np.concatenate([part.observations for part in both])
+    errors = np.concatenate([part.errors for part in both])
+    return torch.from_numpy(observations), torch.from_numpy(np.nan_to_num(errors)).float()
+
+
+def _draw_costs(options: ValueTraining, rng: torch.Generator) -> Tensor:
+    low, high = math.log(options.cost_low), math.log(options.cost_high)
+    return torch.exp(low + (high - low) * torch.rand(options.batch, generator=rng))
+
+
+def _told(observations: Tensor, costs: Tensor) -> Tensor:
+    """Observations ``(n, states, fields)`` with the costs ``(n,)`` as the last field."""
+    shown = torch.from_numpy(np.asarray(cost_coordinate(costs.numpy())))
+    return torch.cat([observations, shown[:, None, None].expand(-1, observations.shape[1], 1)], dim=-1)
+
+
+def _diagonal(errors: Tensor) -> Tensor:
+    """``(n, states)`` error that a trigger saves at once."""
+    return torch.stack([errors[:, k, h] - errors[:, k, k] for k, h in states(errors.shape[1])], dim=1)
+
+
+def _loss(
+    network: ValueNetwork,
+    observations: Tensor,
+    errors: Tensor,
+    costs: Tensor,
+    options: ValueTraining,
+    rng: torch.Generator,
+) -> Tensor:
+    """Mean loss of one batch."""
+    seen = _told(observations, costs) if options.conditioned else observations
+    if options.dropout:
+        kept = torch.rand(len(seen), 1, seen.shape[-1], generator=rng) >= options.dropout
+        kept[..., -1] |= options.conditioned
+        seen = torch.where(kept, seen, network.mean)
+    output = network(seen)
+    if options.objective == "reduction":
+        return torch.nn.functional.smooth_l1_loss(output, _diagonal(errors) / network.unit)
+    price = costs * options.error_scale
+    if options.objective == "planned":
+        probabilities = torch.sigmoid(output)
+        hold, trigger = plan(errors, price, probabilities)
+        # The first state is where every interval starts. Dividing makes cheap and dear triggers count alike.
+        total = hold[:, 0] + probabilities[:, 0] * (trigger[:, 0] - hold[:, 0])
+        return (total / (price + PRICE_OFFSET)).mean()
+    hold, trigger = plan(errors, price)
+    gain = hold - trigger
+    if options.objective == "clone":
+        return torch.nn.functional.binary_cross_entropy_with_logits(output, (gain > 0).float())
+    return torch.nn.functional.smooth_l1_loss(output, gain / (price + PRICE_OFFSET)[:, None])
+
+
+PRICE_OFFSET = 2e-3
+"""Totals are divided by the price plus this error, about what a trigger saves in slow traffic."""
+
+
+def _rate(step: int, steps: int) -> float:
+    """Share of the peak learning rate."""
+    warm = max(1, steps // 10)
+    return min((step + 1) / warm, 0.5 * (1 + math.cos(math.pi * step / steps)))
