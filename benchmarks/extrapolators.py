@@ -26,7 +26,7 @@ from nl_env.config import SPLITS, DrivingConfig
 from nl_env.depth.extrapolators import make_extrapolator
 from nl_env.depth.metrics import METRIC_NAMES, full_metrics, paper_metrics
 from nl_env.realism.published import GAPS_MS
-from nl_env.runs import write_text
+from nl_env.reproduction.document import check_document, update_document
 from nl_env.scene.scene import DrivingScene
 from nl_env.sensors.lidar import quantise
 from nl_env.types import SLICE_US, ExtrapolationInput
@@ -35,7 +35,6 @@ METHODS = (("repeat", False), ("linear", False), ("exponential", False), ("warp"
 """Extrapolator and whether it is given the true camera poses."""
 SHOWN = ("log_mae", "imae", "bad_25", "false_return", "rmse", "abs_rel", "delta_1")
 _PERIOD_US = 100_000
-_BEGIN, _END = "<!-- begin results -->", "<!-- end results -->"
 
 
 @dataclass(frozen=True)
@@ -131,6 +130,8 @@ def table(summary: dict[str, Any]) -> str:
 
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
+    if args.markdown is not None:
+        check_document(args.markdown, "results")
     for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ[variable] = "1"
     seeds = SPLITS["test"][args.seed_start : args.seed_start + args.worlds]
@@ -140,10 +141,8 @@ def main(args: Args) -> None:
     summary = summarise(worlds)
     print(json.dumps({"worlds": args.worlds, "pairs": args.pairs, "methods": summary}, indent=2))
     if args.markdown is not None:
-        text = args.markdown.read_text(encoding="utf-8")
-        head, tail = text.split(_BEGIN)[0], text.split(_END)[1]
         note = f"{args.worlds} test worlds, {args.pairs} LiDAR frames each, 480x640."
-        write_text(args.markdown, f"{head}{_BEGIN}\n\n{note}\n\n{table(summary)}\n\n{_END}{tail}")
+        update_document(args.markdown, "results", f"{note}\n\n{table(summary)}")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,8 @@ from nl_env.depth.runtime import NetworkRunner
 from nl_env.depth.unet import UNet, load_released
 from nl_env.history import SensorHistory
 from nl_env.representations import voxel_from_bins
-from nl_env.runs import THREAD_VARIABLES, write_text
+from nl_env.reproduction.document import check_document, update_document
+from nl_env.runs import THREAD_VARIABLES
 from nl_env.streams import SyntheticStream
 from nl_env.training import seeded
 from nl_env.types import RESOLUTIONS, DepthExtrapolator, ExtrapolationInput
@@ -63,7 +64,6 @@ ROWS: dict[str, Row] = {
 }
 UNET, DETECTOR = "released U-Net", "keyframe CNN"
 EXTRAPOLATORS = ("released extrapolator", "our extrapolator")
-_BEGIN, _END = "<!-- begin results -->", "<!-- end results -->"
 
 
 @dataclass(frozen=True)
@@ -291,6 +291,8 @@ def table(results: Results) -> str:
 
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
+    if args.markdown is not None:
+        check_document(args.markdown, "results")
     contests = {name: {row: (name, ROWS[row]) for row in ROWS} for name in (UNET, DETECTOR)}
     for runtime in ("torch", "OpenVINO", "OpenVINO bf16"):
         contests[f"extrapolators, {runtime}"] = {name: (name, ROWS[runtime]) for name in EXTRAPOLATORS}
@@ -313,13 +315,11 @@ def main(args: Args) -> None:
     }
     print(json.dumps(report, indent=2))
     if args.markdown is not None:
-        text = args.markdown.read_text(encoding="utf-8")
-        head, tail = text.split(_BEGIN)[0], text.split(_END)[1]
         note = (
             f"{args.threads} threads, batch 1, U-Net weights: {weights}. Median ms per depth frame or "
             "decision (times the first row of its kind)."
         )
-        write_text(args.markdown, f"{head}{_BEGIN}\n\n{note}\n\n{table(results)}\n\n{_END}{tail}")
+        update_document(args.markdown, "results", f"{note}\n\n{table(results)}")
 
 
 if __name__ == "__main__":

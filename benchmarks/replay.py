@@ -36,14 +36,13 @@ from nl_env.depth.extrapolators import make_extrapolator
 from nl_env.observations import OBS_MODES
 from nl_env.recording import record_sequence
 from nl_env.recording_stream import RecordingStream
-from nl_env.runs import write_text
+from nl_env.reproduction.document import check_document, update_document
 from nl_env.trace_files import SUFFIX, write_trace
 from nl_env.trace_source import TraceSource, file_digest, identify_extrapolator
 from nl_env.traces import trace_sequence
 
 EXTRAPOLATOR = "repeat"
 PROCESSES = 2
-_BEGIN, _END = "<!-- begin results -->", "<!-- end results -->"
 
 
 @dataclass(frozen=True)
@@ -183,12 +182,12 @@ def table(rows: list[Row]) -> str:
 
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
+    if args.markdown is not None:
+        check_document(args.markdown, "results")
     rows = measure(args)
     print(json.dumps({**asdict(args), "markdown": None, "rows": [asdict(row) for row in rows]}, indent=2))
     if args.markdown is not None:
-        text = args.markdown.read_text(encoding="utf-8")
-        head, tail = text.split(_BEGIN)[0], text.split(_END)[1]
-        write_text(args.markdown, f"{head}{_BEGIN}\n\n{table(rows)}\n\n{_END}{tail}")
+        update_document(args.markdown, "results", table(rows))
 
 
 if __name__ == "__main__":

@@ -35,13 +35,12 @@ from agents.keyframe_networks import FrameDetector
 from nl_env.depth.losses import meter_loss
 from nl_env.depth.runtime.allocator import keep_large_blocks
 from nl_env.depth.unet import UNet
-from nl_env.runs import write_text
+from nl_env.reproduction.document import check_document, update_document
 from nl_env.training import Forward, TrainingOptions, train
 from nl_env.training.options import uses_bf16
 from nl_env.weight_files import Card
 
 SHAPE = (120, 160)
-_BEGIN, _END = "<!-- begin results -->", "<!-- end results -->"
 
 
 @dataclass(frozen=True)
@@ -296,6 +295,8 @@ def table(summary: list[dict[str, Any]]) -> str:
 
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
+    if args.markdown is not None:
+        check_document(args.markdown, "results")
     os.environ["OMP_NUM_THREADS"] = str(args.threads)
     batches = {"U-Net": args.unet_batch, "keyframe CNN": args.keyframe_batch}
     rows = [
@@ -313,13 +314,11 @@ def main(args: Args) -> None:
     }
     print(json.dumps({"machine": machine, "shape": SHAPE, "rows": summary}, indent=2))
     if args.markdown is not None:
-        text = args.markdown.read_text(encoding="utf-8")
-        head, tail = text.split(_BEGIN)[0], text.split(_END)[1]
         note = (
             f"120x160, {args.threads} threads on {machine['cores']} cores, "
             f"PyTorch {machine['torch']}, {args.turns} turns of {args.steps} steps."
         )
-        write_text(args.markdown, f"{head}{_BEGIN}\n\n{note}\n\n{table(summary)}\n\n{_END}{tail}")
+        update_document(args.markdown, "results", f"{note}\n\n{table(summary)}")
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 import nl_env
 from agents.catalogue import make_policy
+from nl_env.command_line import run_command
 from nl_env.evaluation import play
 from nl_env.trace_files import default_folder, open_traces
 from nl_env.traces import SequenceTrace
@@ -108,8 +109,11 @@ def collect(arguments: Arguments) -> list[str]:
     """
     if arguments.root is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(arguments.root)
-    import minari
-    from minari.data_collector import EpisodeBuffer
+    try:
+        import minari
+        from minari.data_collector import EpisodeBuffer
+    except ImportError as error:
+        raise ImportError(f"{error}; pip install 'nl-env[minari]'") from error
 
     tables = default_folder(arguments.data, arguments.extrapolator)
     traces = open_traces(tables)
@@ -153,16 +157,11 @@ def collect(arguments: Arguments) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    try:
-        names = collect(tyro.cli(Arguments, args=arguments, description=__doc__))
-    except ImportError as error:
-        print(f"collect_minari: {error}; pip install 'nl-env[minari]'", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"collect_minari: {error}", file=sys.stderr)
-        return 2
-    print("\n".join(names))
-    return 0
+
+    def work(given: list[str]) -> None:
+        print("\n".join(collect(tyro.cli(Arguments, args=given, description=__doc__))))
+
+    return run_command("collect_minari", work, arguments, errors=(ImportError,))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -25,6 +24,7 @@ import nl_env
 from agents.catalogue import FAMILIES, PolicyName, make_policy, parse_policy
 from agents.oracle import oracle_curve
 from agents.schedules import Scheduler
+from nl_env.command_line import run_command
 from nl_env.comparison import PolicyInfo, SequenceResult, compare, evaluate_sequence
 from nl_env.config import (
     SPLITS,
@@ -239,19 +239,11 @@ def run(options: Options) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
-        run(options)
-    except (ValueError, OSError) as error:
-        print(f"compare: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-        command = shlex.join(["python", "scripts/compare.py", *again, "--resume"])
-        print(f"\ninterrupted; finished sequences are kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("compare", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
 from nl_env import colours
+from nl_env.command_line import run_command
 from nl_env.config import SCENARIOS, SPLITS, STYLES, WEATHERS, DrivingConfig, SceneConfig, number
 from nl_env.representations import frame_from_bins
 from nl_env.scene.scene import DrivingScene
@@ -107,16 +108,15 @@ def draw_sheet(options: Options) -> Image.Image:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
+
+    def work(given: list[str]) -> None:
+        options = tyro.cli(Options, args=given, description=__doc__)
         options.validate()
         options.out.parent.mkdir(parents=True, exist_ok=True)
         draw_sheet(options).save(options.out, optimize=True)
         print(f"{options.out}: {options.out.stat().st_size / 1e6:.2f} MB")
-    except (ValueError, OSError) as error:
-        print(f"contact_sheet: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return run_command("contact_sheet", work, arguments)
 
 
 if __name__ == "__main__":

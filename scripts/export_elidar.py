@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import shutil
 import sys
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ import tyro
 from tqdm import tqdm
 
 import nl_env
+from nl_env.command_line import run_command
 from nl_env.elidar.export import ExportOptions, assemble, write_part
 from nl_env.elidar.layout import SHAPE, SPLITS
 from nl_env.elidar.plan import sequence_names, split_of_seed
@@ -175,18 +175,11 @@ def run(options: Options) -> list[dict[str, Any]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        run(tyro.cli(Options, args=arguments, description=__doc__))
-    except (ValueError, OSError) as error:
-        print(f"export_elidar: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-        command = shlex.join(["python", "scripts/export_elidar.py", *again, "--resume"])
-        print(f"\ninterrupted; finished sequences are kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("export_elidar", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ output folder, so an interrupted run continues with --resume.
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -26,6 +25,7 @@ import nl_env
 from agents.catalogue import FAMILIES, WEIGHTS, make_policy, parse_policy
 from agents.oracle import oracle_curve
 from agents.schedules import Scheduler
+from nl_env.command_line import command_line, run_command
 from nl_env.comparison import SequenceResult, compare, evaluate_sequence
 from nl_env.config import number
 from nl_env.depth.extrapolators import make_extrapolator
@@ -245,18 +245,11 @@ def document_sections(comparison: Any) -> list[Section]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    command = shlex.join(["python", "scripts/frontier.py", *arguments])
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
-        run(options, command)
-    except (ValueError, OSError) as error:
-        print(f"frontier: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted; finished sequences are kept. Continue with --resume.", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__), command_line("frontier", given))
+
+    return run_command("frontier", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a chec
 
 import tyro
 
+from nl_env.command_line import run_command
 from nl_env.importing import DepthMaps, Imported, ImportOptions, import_recording, open_events
 
 
@@ -70,15 +71,11 @@ def run(options: Options) -> Imported:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    try:
-        run(tyro.cli(Options, args=arguments, description=__doc__))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"import_events: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted; nothing was written", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("import_events", work, arguments, errors=(ImportError,))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a chec
 import tyro
 from PIL import Image
 
+from nl_env.command_line import run_command
 from nl_env.elidar.layout import RANGE
 from nl_env.inspection import Findings, Reading, inspect_path
 from nl_env.runs import replacing
@@ -64,8 +65,9 @@ def write_figure(path: Path, found: Sequence[Findings]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status: 1 where there are problems, 2 where nothing could be read."""
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
+
+    def work(given: list[str]) -> int:
+        options = tyro.cli(Options, args=given, description=__doc__)
         reading = Reading(options.verify, options.max_depth, pictures=options.figure is not None)
         found = inspect_path(options.path, reading)
         if options.json:
@@ -74,10 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join(findings.text() for findings in found))
         if options.figure:
             write_figure(options.figure, found)
-    except (ValueError, OSError) as error:
-        print(f"inspect_data: {error}", file=sys.stderr)
-        return 2
-    return 1 if any(findings.problems for findings in found) else 0
+        return 1 if any(findings.problems for findings in found) else 0
+
+    return run_command("inspect_data", work, arguments)
 
 
 if __name__ == "__main__":

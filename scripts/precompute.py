@@ -8,7 +8,6 @@ Every finished sequence is kept, so an interrupted run continues with --resume.
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -19,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # runs from a chec
 import tyro
 from tqdm import tqdm
 
+from nl_env.command_line import run_command
 from nl_env.config import LidarConfig, number
 from nl_env.depth.extrapolators import make_extrapolator
 from nl_env.recording_stream import RecordingStream
@@ -156,21 +156,11 @@ def run(options: Options) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-    command = shlex.join(["python", "scripts/precompute.py", *again, "--resume"])
-    try:
-        run(tyro.cli(Options, args=arguments, description=__doc__))
-    except ValueError as error:
-        print(f"precompute: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"precompute: {error}\nFinished sequences are kept; see --resume.", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\ninterrupted; finished sequences are kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("precompute", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,6 +20,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
+from nl_env.command_line import run_command
 from nl_env.config import SPLITS, DrivingConfig, EventCameraConfig, number
 from nl_env.realism.plots import DEPTH_PLOT, EVENT_PLOT, save_plots
 from nl_env.realism.summary import Summary, summarise
@@ -184,18 +184,11 @@ def run(options: Options) -> Summary:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        run(tyro.cli(Options, args=arguments, description=__doc__))
-    except (ValueError, OSError) as error:
-        print(f"realism: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-        command = shlex.join(["python", "scripts/realism.py", *again, "--resume"])
-        print(f"\ninterrupted; finished worlds are kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("realism", work, arguments, kept="finished worlds are kept")
 
 
 if __name__ == "__main__":

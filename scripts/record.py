@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,6 +21,7 @@ import tyro
 from tqdm import tqdm
 
 import nl_env
+from nl_env.command_line import run_command
 from nl_env.config import (
     SPLITS,
     DrivingConfig,
@@ -209,21 +209,11 @@ def run(options: Options) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-    command = shlex.join(["python", "scripts/record.py", *again, "--resume"])
-    try:
-        run(tyro.cli(Options, args=arguments, description=__doc__))
-    except ValueError as error:
-        print(f"record: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"record: {error}\nFinished sequences are kept; see --resume.", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\ninterrupted; finished sequences are kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__))
+
+    return run_command("record", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Every finished sequence is kept in the output folder, so an interrupted run cont
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from tqdm import tqdm
 from agents.keyframe_cnn import FRAME_WEIGHTS, TEMPORAL_WEIGHTS, KeyframeCNN
 from agents.oracle import priced_schedule
 from agents.table_policies import FRAME, TEMPORAL, LoadScorers, PlayPolicies
+from nl_env.command_line import command_line, run_command
 from nl_env.config import number
 from nl_env.depth.extrapolators import WEIGHTS
 from nl_env.depth.metrics import METRIC_NAMES
@@ -370,20 +370,11 @@ Table = TableKeyframe | TableRates | TableAblation | TableEndToEnd
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-    command = shlex.join(["python", "scripts/reproduce.py", *again])
-    try:
-        tyro.cli(Table, args=arguments, description=__doc__).run(command)
-    except (ValueError, OSError) as error:
-        print(f"reproduce: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(
-            f"\ninterrupted; finished sequences are kept. Continue with: {command} --resume", file=sys.stderr
-        )
-        return 130
-    return 0
+
+    def work(given: list[str]) -> None:
+        tyro.cli(Table, args=given, description=__doc__).run(command_line("reproduce", given))
+
+    return run_command("reproduce", work, arguments, kept="finished sequences are kept")
 
 
 if __name__ == "__main__":

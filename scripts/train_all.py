@@ -23,6 +23,7 @@ sys.path.insert(0, str(ROOT))  # runs from a checkout, wherever the command is s
 
 import tyro
 
+from nl_env.command_line import run_command
 from nl_env.config import choice, number
 from nl_env.depth.extrapolators import WEIGHTS
 from nl_env.runs import THREAD_VARIABLES, write_text
@@ -367,8 +368,9 @@ def measured(table: Mapping[str, Any], network: Network) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
+
+    def work(given: list[str]) -> None:
+        options = tyro.cli(Options, args=given, description=__doc__)
         options.validate()
         options = replace(options, out=placed(options.out), weights=placed(options.weights))
         plan, runner = Plan(options), Runner(ROOT / options.out / "train-all")
@@ -379,13 +381,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             runner.run(plan.steps(stage), options.jobs if stage in ("train", "ablations") else 1)
             if stage == "ship":
                 ship(plan)
-    except (ValueError, OSError, RuntimeError) as error:
-        print(f"train_all: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("\ninterrupted; run the same command again to continue", file=sys.stderr)
-        return 130
-    return 0
+
+    kept = "finished steps are kept"
+    return run_command("train_all", work, arguments, kept=kept, again="", errors=(RuntimeError,))
 
 
 if __name__ == "__main__":

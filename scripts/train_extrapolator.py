@@ -25,7 +25,6 @@ any of the commands goes on with --resume and ends with the same weights as if i
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -38,6 +37,7 @@ sys.path.insert(0, str(ROOT))  # runs from a checkout, wherever the command is s
 import tyro
 from tqdm import tqdm
 
+from nl_env.command_line import command_line, run_command
 from nl_env.config import choice
 from nl_env.depth.elidar_pairs import ElidarOptions, open_elidar_pairs
 from nl_env.depth.examples import Augmentation, PairSource
@@ -204,26 +204,20 @@ class Join:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-    command = shlex.join(["python", "scripts/train_extrapolator.py", *again])
-    try:
+
+    def work(given: list[str]) -> None:
         options = tyro.cli(
             Annotated[PairsCommand, tyro.conf.subcommand("pairs")]
             | Annotated[Ours, tyro.conf.subcommand("ours")]
             | Annotated[Paper, tyro.conf.subcommand("paper")]
             | Annotated[Join, tyro.conf.subcommand("join")],
-            args=arguments,
+            args=given,
             description=__doc__,
         )
-        print(options.run(command))
-    except (ValueError, OSError, FloatingPointError) as error:
-        print(f"train_extrapolator: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"\ninterrupted; checkpoints are kept. Continue with: {command} --resume", file=sys.stderr)
-        return 130
-    return 0
+        print(options.run(command_line("train_extrapolator", given)))
+
+    kept = "the last checkpoint is kept"
+    return run_command("train_extrapolator", work, arguments, kept=kept, errors=(FloatingPointError,))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ same command with --resume goes on.
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -43,6 +42,7 @@ from agents.keyframe_training import (
     detect,
 )
 from nl_env.classification import summarise_detector
+from nl_env.command_line import command_line, run_command
 from nl_env.elidar import elidar_in
 from nl_env.evaluation import resample_sequences
 from nl_env.training import Task, TrainingOptions, seeded, train
@@ -182,7 +182,7 @@ def data_of(options: Options) -> tuple[FrameSource, FrameSource]:
     return open_elidar_frames(files.require_slicing(), options.held_out)
 
 
-def run(options: Options) -> Card:
+def run(options: Options, command: str) -> Card:
     """Train, calibrate, and complete the card beside the weights."""
     training, validation = data_of(options)
     network, arguments = network_of(options, training)
@@ -192,7 +192,7 @@ def run(options: Options) -> Card:
         options=arguments,
         data={"training": training.summary, "validation": validation.summary},
         training={
-            "command": shlex.join(["python", "scripts/train_keyframe.py", *sys.argv[1:]]),
+            "command": command,
             "sampling": asdict(options.sampling),
             "nl_env": nl_env.__version__,
         },
@@ -281,20 +281,13 @@ def calibrated(weights: Path, validation: FrameSource, threads: int) -> Card:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        options = tyro.extras.overridable_config_cli(RECIPES, args=arguments, description=__doc__)
-        card = run(options)
-    except (ValueError, OSError, FloatingPointError) as error:
-        print(f"train_keyframe: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = [argument for argument in arguments if argument not in ("--overwrite", "--resume")]
-        command = shlex.join(["python", "scripts/train_keyframe.py", *again, "--resume"])
-        print(f"\ninterrupted; the last checkpoint is kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    print_result(options, card)
-    return 0
+
+    def work(given: list[str]) -> None:
+        options = tyro.extras.overridable_config_cli(RECIPES, args=given, description=__doc__)
+        print_result(options, run(options, command_line("train_keyframe", given)))
+
+    kept = "the last checkpoint is kept"
+    return run_command("train_keyframe", work, arguments, kept=kept, errors=(FloatingPointError,))
 
 
 def print_result(options: Options, card: Card) -> None:

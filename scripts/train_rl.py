@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 import shutil
 import sys
 from collections.abc import Sequence
@@ -36,6 +35,7 @@ from agents.rl_training.training import Options, train
 from agents.rl_training.validation import Validation
 from agents.sb3_vec_env import ReplayVecEnv
 from nl_env.batched_replay import BatchedReplayEnv
+from nl_env.command_line import command_line, run_command
 from nl_env.trace_files import default_folder, open_traces, read_source, trace_files
 from nl_env.training.log import LOG_FILE
 from nl_env.training.run import BEST
@@ -86,7 +86,7 @@ class Arguments:
     """Continue the run that is in the output folder."""
 
 
-def run(arguments: Arguments) -> Card:
+def run(arguments: Arguments, command: str) -> Card:
     """Train, and return the card of the best weights."""
     path = Path(arguments.hyperparameters)
     if not path.suffix:
@@ -113,7 +113,7 @@ def run(arguments: Arguments) -> Card:
             "validation": described(validation_tables, [trace.seed for trace in validation.traces]),
         },
         training={
-            "command": shlex.join(["python", "scripts/train_rl.py", *sys.argv[1:]]),
+            "command": command,
             "nl_env": nl_env.__version__,
         },
     )
@@ -192,21 +192,13 @@ def described(tables: Path, seeds: Sequence[int]) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        parsed = tyro.cli(Arguments, args=given, description=__doc__)
-        card = run(parsed)
-    except (ValueError, OSError) as error:
-        print(f"train_rl: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = [argument for argument in given if argument not in ("--overwrite", "--resume")]
-        command = shlex.join(["python", "scripts/train_rl.py", *again, "--resume"])
-        print(f"\ninterrupted; the last checkpoint is kept. Continue with: {command}", file=sys.stderr)
-        return 130
-    print(json.dumps(card.metrics["validation"]))
-    print(f"{BEST}: after {card.training['steps']} of {card.training['steps_in_all']} steps")
-    return 0
+
+    def work(given: list[str]) -> None:
+        card = run(tyro.cli(Arguments, args=given, description=__doc__), command_line("train_rl", given))
+        print(json.dumps(card.metrics["validation"]))
+        print(f"{BEST}: after {card.training['steps']} of {card.training['steps_in_all']} steps")
+
+    return run_command("train_rl", work, arguments, kept="the last checkpoint is kept")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ gives the same weights. docs/policies.md compares the objectives.
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ import tyro
 import nl_env
 from agents.decisions import Decisions, collect
 from agents.value_training import Trained, ValueTraining, train
+from nl_env.command_line import command_line, run_command
 from nl_env.config import number
 from nl_env.trace_files import open_traces, read_source, trace_files
 from nl_env.weight_files import Card, write_weights
@@ -137,14 +137,11 @@ def _report(step: int, loss: float, excess: float) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit status."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        options = tyro.cli(Options, args=arguments, description=__doc__)
-        run(options, shlex.join(["python", "scripts/train_value.py", *arguments]))
-    except (ValueError, OSError) as error:
-        print(f"train_value: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    def work(given: list[str]) -> None:
+        run(tyro.cli(Options, args=given, description=__doc__), command_line("train_value", given))
+
+    return run_command("train_value", work, arguments)
 
 
 if __name__ == "__main__":

@@ -62,6 +62,11 @@ def test_checkers_accept_a_cost_for_each_episode(env_id, obs_mode):
         warnings.simplefilter("error")
         gymnasium_check(env.unwrapped, skip_render_check=True)
         sb3_check(env.unwrapped)
+    costs = set()
+    for seed in range(4):
+        env.reset(seed=seed)
+        costs.add(env.unwrapped.trigger_cost)
+    assert len(costs) == 4 and all(0.01 <= cost <= 1.0 for cost in costs)
     env.close()
 
 

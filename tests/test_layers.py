@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = (
     ("types",),
-    ("config", "runs"),
+    ("command_line", "config", "runs"),
     ("scene", "sensors", "representations", "keyframes", "statistics", "costs"),
     ("simulator",),
     ("recording", "weight_files"),

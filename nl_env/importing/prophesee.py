@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -97,7 +98,7 @@ class Header:
         return shape
 
 
-class PropheseeEvents:
+class PropheseeEvents(ABC):
     """What the three formats share; an :class:`nl_env.importing.EventSource`.
 
     There is no index: a window is found by decoding what comes before it, and the last event by decoding
@@ -143,7 +144,7 @@ class PropheseeEvents:
         for _ in self._checked():
             pass
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - part of the protocol, with nothing to do here
         """Nothing stays open between calls."""
 
     def _scan(self) -> tuple[int, int, int]:
@@ -168,9 +169,9 @@ class PropheseeEvents:
             yield checker(first, t, x, y, p)
             first += len(t)
 
+    @abstractmethod
     def _decoded(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Columns t, x, y, p of successive events."""
-        raise NotImplementedError
 
     def _words(self, dtype: Any, begin: int) -> NDArray[Any]:
         """The file from ``begin`` on, mapped; raises ``ValueError`` unless it is a whole number of words."""
