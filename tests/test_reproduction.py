@@ -309,17 +309,17 @@ def test_rows_join_training_seeds(data):
 
 # Variants and targets
 
-OURS_CARD = {"motion": {"channels": [8]}, "refine": {"heads": 3}, "warped": True, "events": True}
+OURS_CARD = {"motion": None, "refine": {"heads": 3}, "warped": True, "events": True}
 
 
 @pytest.mark.parametrize(
     ("options", "training", "row", "odometry"),
     [
         ({}, {}, "ours", False),
-        ({"refine": None}, {}, "ours: motion and warp only", False),
-        ({"motion": None, "warped": False}, {}, "ours: refinement only", False),
-        ({"motion": None}, {"odometry": True}, "ours: true motion", True),
-        ({"motion": None}, {}, "ours: last motion continued", False),
+        ({"motion": {"channels": [8]}}, {}, "ours: motion network", False),
+        ({"motion": {"channels": [8]}, "refine": None}, {}, "ours: motion and warp only", False),
+        ({"warped": False}, {}, "ours: refinement only", False),
+        ({}, {"odometry": True}, "ours: true motion", True),
         ({"events": False}, {}, "ours: without events", False),
         ({"refine": {"heads": 1}}, {}, "ours: one head", False),
     ],

@@ -72,7 +72,7 @@ def _of_ours(card: Card) -> Variant:
         "motion and warp only": refine is None,
         "refinement only": not warped,
         "true motion": odometry,
-        "last motion continued": warped and card.options["motion"] is None and not odometry,
+        "motion network": refine is not None and card.options["motion"] is not None,
         "without events": not card.options.get("events", True),
         "one head": refine is not None and refine.get("heads") == 1,
         "without neighbours": refine is not None and not refine.get("neighbours", True),
