@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from nl_env.config import number
 from nl_env.elidar import ElidarFiles, ExtrapolationData, RawSequence, find_files, read_sequence_list
 from nl_env.elidar.layout import RANGE
+from nl_env.elidar.metadata import warn_of
 from nl_env.elidar.walks import find_walks
 from nl_env.types import BINS, TICK_US, TICKS_PER_SLICE, Camera, EgoState, Sample
 
@@ -67,7 +68,7 @@ class ElidarStream:
         sequences: names, or None for all.
         max_depth: range, m: 200 outdoors, 9 indoors.
         fov_deg: horizontal field of view, which the files do not say.
-        on_error: ``"skip"`` leaves broken sequences out.
+        on_error: ``"skip"`` leaves out broken sequences, and labels that cannot be read; warns of each.
 
     Raises:
         FileNotFoundError, ValueError: as :class:`nl_env.elidar.ExtrapolationData`.
@@ -88,6 +89,8 @@ class ElidarStream:
         self.data = ExtrapolationData(
             *files.require_pairs(), split=split, sequences=sequences, max_depth=max_depth, on_error=on_error
         )
+        warn_of(self.data.problems)
+        self.on_error = on_error
         self.episodes = tuple(
             Episode(name, walk, phase, rows[phase:])
             for name, pairs in self.data.sequences.items()
@@ -209,7 +212,13 @@ class ElidarStream:
         """The raw sequence, if there is one and its event frames are those of the voxel grids."""
         if sequence not in self.files.raw:
             return None
-        raw = RawSequence(self.files.raw[sequence])
+        try:
+            raw = RawSequence(self.files.raw[sequence])
+        except ValueError as error:
+            if self.on_error == "raise":
+                raise
+            warnings.warn(f"{sequence} has no labels: {error}", stacklevel=2)
+            return None
         pairs = self.data.sequences[sequence]
         starts = self.data.ticks[sequence][pairs.prior]
         aligned = np.flatnonzero((pairs.duration == TICKS_PER_SLICE) & (starts % TICKS_PER_SLICE == 0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from nl_env.config import SPLITS, choice
 from nl_env.costs import TriggerCost
 from nl_env.elidar import find_files
 from nl_env.elidar.layout import HDF5_SUFFIXES, RANGE, hdf5_kind
+from nl_env.elidar.metadata import ON_ERROR
 from nl_env.elidar_stream import ElidarStream
 from nl_env.env import INFO_METRICS, AdaptiveDepthEnv
 from nl_env.held_depth import HeldDepth
@@ -75,7 +77,8 @@ class ReplayEnv(AdaptiveDepthEnv):
       depth frames: `env.unwrapped.depth` and its like raise `RuntimeError`. Recordings only.
     * `tables`: folder of the stored traces; None is `DATA-tables-EXTRAPOLATOR`, beside the data.
     * `max_depth`, `fov`: ELiDAR only, range in m (200; indoors 9), horizontal field of view in degrees (75).
-    * `on_error`: ELiDAR only, `"raise"` (default) or `"skip"` for broken sequences.
+    * `on_error`: `"raise"` (default), or `"skip"`: broken ELiDAR sequences, and files beside recordings that
+      cannot be read, are left out, and a warning names each.
     * `extrapolator`, `odometry`, `runtime`, `obs_mode`, `error`, `error_scale`, `trigger_cost`,
       `render_mode`: as in `nl_env/Driving-v0`. ELiDAR has no odometry. Recordings render if
       they were made with pictures.
@@ -109,7 +112,8 @@ class ReplayEnv(AdaptiveDepthEnv):
         choice("errors", errors, ("compute", "table"))
         if tables is not None and errors != "table":
             raise ValueError(f"tables: found {str(tables)!r} with errors={errors!r}, expected errors='table'")
-        recordings = find_recordings(Path(data))
+        choice("on_error", on_error, ON_ERROR)
+        recordings = find_recordings(Path(data), on_error)
         stream: RecordingStream | ElidarStream | TraceStream
         held_depth: HeldDepth | None = None
         if recordings:
@@ -191,12 +195,16 @@ def choose_sequence(
     return sequences[int(rng.integers(len(sequences)))]
 
 
-def find_recordings(data: Path) -> list[Path]:
+def find_recordings(data: Path, on_error: str = "raise") -> list[Path]:
     """The native recordings at ``data``; empty if it holds something else.
+
+    Args:
+        data: a recording, or a folder of recordings.
+        on_error: ``"skip"`` warns of files beside recordings that cannot be read instead of raising.
 
     Raises:
         FileNotFoundError: no such file or folder.
-        ValueError: a single file that is no recording, or damaged files beside recordings.
+        ValueError: a single file that is no recording, or (``"raise"``) damaged files beside recordings.
     """
     if data.is_file():
         kind = hdf5_kind(data)
@@ -213,8 +221,11 @@ def find_recordings(data: Path) -> list[Path]:
                     recordings.append(path)
             except ValueError as error:
                 unreadable.append(error)
-    if recordings and unreadable:
+    if recordings and unreadable and on_error == "raise":
         raise unreadable[0]
+    if recordings:
+        for reason in unreadable:
+            warnings.warn(f"left out {reason}", stacklevel=3)
     return recordings
 
 
@@ -289,11 +300,15 @@ def trace_stream(
 
 
 def require_poses(paths: Sequence[Path]) -> None:
-    """Raise ``ValueError`` if a recording was imported: real event cameras come without camera poses."""
+    """Raise ``ValueError`` if a recording was imported without a camera pose at every slice."""
     for path in paths:
         with Recording(path) as recording:
-            if "layout" in recording.description:
-                raise ValueError(f"odometry: found True, but {path} holds no poses; expected False")
+            known = recording.description.get("pose_slices", 0)
+            if "layout" in recording.description and known <= recording.slices:
+                raise ValueError(
+                    f"odometry: found True, but {path} holds poses at {known} of {recording.slices + 1} "
+                    "slices; expected False"
+                )
 
 
 def _seed(path: Path) -> int:

@@ -1,4 +1,4 @@
-"""Say what is in a file or folder: recordings, ELiDAR's files, or weights, and what is wrong with them.
+"""Say what is in a file or folder: recordings, ELiDAR's files, real sensors', or weights, and what is wrong.
 
 Its name is not inspect.py because that would hide Python's own module of this name from every script here.
 """
@@ -30,7 +30,7 @@ class Options:
     """Say what is in a file or folder."""
 
     path: tyro.conf.Positional[Path]
-    """A recording, a folder of recordings, a file or folder of ELiDAR, or weights."""
+    """A recording, a folder of recordings, a file or folder of ELiDAR or of real sensors, or weights."""
     verify: bool = False
     """Read everything, so that damage is found wherever it is."""
     max_depth: float = RANGE

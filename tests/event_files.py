@@ -2,6 +2,7 @@
 
 import h5py
 import numpy as np
+from PIL import Image
 
 from nl_env.types import EVENT_DTYPE
 
@@ -53,12 +54,74 @@ def write_m3ed(path, events, shape, intrinsics=None, group="prophesee/left"):
     return path
 
 
-def write_depth(path, depth, times, name="depth/prophesee/left"):
-    """M3ED's depth file: maps in metres, infinite where there is no return, and their times."""
+def write_depth(path, depth, times, name="depth/prophesee/left", **filters):
+    """M3ED's depth file: maps in metres, infinite without a return, and their times, floats in us."""
     with h5py.File(path, "w") as file:
         chunks = (1, *depth.shape[1:])
-        file.create_dataset(name, data=depth.astype("f4"), chunks=chunks, compression="lzf")
-        file["ts"] = np.asarray(times, "i8")
+        file.create_dataset(
+            name, data=depth.astype("f4"), chunks=chunks, **(filters or {"compression": "lzf"})
+        )
+        file["ts"] = np.asarray(times, "f8")
+    return path
+
+
+def driving_poses(times, speed, turn_rate=0.0, start_us=0):
+    """``Cn_T_C0`` of a camera that drives forward at ``speed`` m/s and turns right at ``turn_rate`` rad/s."""
+    motions = np.tile(np.eye(4), (len(times), 1, 1))
+    for motion, t in zip(motions, (np.asarray(times) - start_us) * 1e-6, strict=True):
+        angle = turn_rate * t
+        c, s = np.cos(angle), np.sin(angle)
+        camera_to_first = np.eye(4)
+        camera_to_first[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        way = [speed * t, 0.0] if turn_rate == 0 else [speed / turn_rate * s, speed / turn_rate * (1 - c)]
+        camera_to_first[:3, 3] = [way[1], 0, way[0]]
+        motion[:] = np.linalg.inv(camera_to_first)
+    return motions
+
+
+def write_poses(path, motions, times, mode="w", camera="/prophesee/left"):
+    """M3ED's pose file, or with ``mode="r+"`` the same in its depth file."""
+    with h5py.File(path, mode) as file:
+        file["Cn_T_C0"] = motions
+        file.require_dataset("ts", (len(times),), "f8")[...] = times
+        file.attrs["cam_name"] = camera
+    return path
+
+
+BASELINE, RECTIFIED_FOCAL = 0.6, 560.0
+
+
+def write_calibration(path, shape=DSEC_SHAPE, focal=RECTIFIED_FOCAL, baseline=BASELINE):
+    """The part of DSEC's ``cam_to_cam.yaml`` that is read, among some that is not."""
+    height, width = shape
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    path.write_text(
+        "intrinsics:\n"
+        "  cam0:\n    camera_model: pinhole\n    camera_matrix: [500.0, 501.0, 300.0, 200.0]\n"
+        f"  camRect0:\n    camera_model: pinhole\n    camera_matrix: [{focal}, {focal}, {cx}, {cy}]\n"
+        f"    resolution: [{width}, {height}]\n"
+        "disparity_to_depth:\n  cams_03:\n"
+        f"  - [1.0, 0.0, 0.0, {-cx}]\n  - [0.0, 1.0, 0.0, {-cy}]\n"
+        f"  - [0.0, 0.0, 0.0, {focal}]\n  - [0.0, 0.0, {1 / baseline}, 0.0]\n"
+    )
+    return path
+
+
+def write_disparity(folder, depth, times, focal=RECTIFIED_FOCAL, baseline=BASELINE):
+    """DSEC's ``disparity``: 16-bit pictures, 0 without depth, named by every second image, and times."""
+    (folder / "event").mkdir(parents=True)
+    for k, metres in enumerate(depth):
+        found = metres > 0
+        disparity = np.where(found, 256 * focal * baseline / np.where(found, metres, 1), 0)
+        Image.fromarray(np.rint(disparity).astype(np.uint16)).save(folder / "event" / f"{2 * k:06}.png")
+    (folder / "timestamps.txt").write_text("".join(f"{t}\n" for t in times))
+    return folder
+
+
+def write_rectify_map(path, places):
+    """DSEC's ``rectify_map.h5``: column and row of every pixel in the rectified picture."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("rectify_map", data=np.asarray(places, "f4"), compression="gzip")
     return path
 
 

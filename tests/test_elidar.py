@@ -4,6 +4,7 @@ import multiprocessing
 import pickle
 import subprocess
 import sys
+import zipfile
 
 import h5py
 import numpy as np
@@ -21,6 +22,31 @@ from nl_env.elidar import (
 from nl_env.elidar.layout import METADATA_FILE, PAIRS_FILE
 
 NAME = "Town01_Opt_00"
+
+
+def flip_chunk(path, name, chunk):
+    """Invert four bytes in the middle of a chunk."""
+    with h5py.File(path) as file:
+        found = file[name].id.get_chunk_info(chunk)
+    flip(path, found.byte_offset + found.size // 2)
+
+
+def flip(path, place):
+    """Invert four bytes."""
+    content = bytearray(path.read_bytes())
+    content[place : place + 4] = bytes(255 - byte for byte in content[place : place + 4])
+    path.write_bytes(content)
+
+
+def unknown_filter(path, group, name, shape):
+    """Add a dataset, one image a chunk, that nothing here can decompress."""
+    with h5py.File(path, "r+") as file:
+        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        properties.set_chunk((1, *shape[1:]))
+        properties.set_filter(32_900, h5py.h5z.FLAG_OPTIONAL)  # a number that no package claims
+        space = h5py.h5s.create_simple(shape)
+        dataset = h5py.h5d.create(file[group].id, name, h5py.h5t.IEEE_F32LE, space, properties)
+        dataset.write_direct_chunk((0,) * len(shape), b"compressed by something")
 
 
 def masked(k):
@@ -202,6 +228,26 @@ def test_impossible_event_frames_are_refused_when_they_are_read(tmp_path, value)
         data[3]
 
 
+def test_flipped_bytes_in_a_labelled_frame_are_found(tmp_path):
+    path = tmp_path / "slicing.h5"
+    frames = np.random.default_rng(0).integers(-3, 4, (3, *SIZE)).astype(np.int16)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("train/event_frames", data=frames, chunks=(1, *SIZE), fletcher32=True)
+        file["train/scores"] = np.zeros(3)
+    flip_chunk(path, "train/event_frames", 1)
+    data = SlicingData(path, "train")
+    np.testing.assert_array_equal(data[0][0], frames[0])
+    with pytest.raises(ValueError, match=r"slicing\.h5: train/event_frames\[1\]: damaged or truncated"):
+        data[1]
+
+
+def test_labelled_frames_behind_a_missing_filter_name_the_plugin(tmp_path):
+    path = write_slicing(tmp_path / "slicing.h5", event_frames=None)
+    unknown_filter(path, "train", b"event_frames", (3, *SIZE))
+    with pytest.raises(ValueError, match=r"event_frames: compressed with filter 32900 .*hdf5plugin"):
+        SlicingData(path, "train")[0]
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
 def test_a_truncated_slicing_file_is_refused(tmp_path, share):
     path = write_slicing(tmp_path / "slicing.h5")
@@ -285,13 +331,7 @@ def test_a_truncated_file_is_refused(tmp_path, share):
 
 def test_flipped_bytes_in_a_chunk_are_found(tmp_path):
     hdf5, metadata = write_pairs(tmp_path, chunks=(1, 5, *SIZE), compression="gzip")
-    with h5py.File(hdf5) as file:
-        chunk = file[f"{NAME}/events"].id.get_chunk_info(2)
-    with open(hdf5, "rb+") as file:
-        file.seek(chunk.byte_offset + chunk.size // 2)
-        middle = file.read(4)
-        file.seek(-4, 1)
-        file.write(bytes(255 - byte for byte in middle))
+    flip_chunk(hdf5, f"{NAME}/events", 2)
     data = ExtrapolationData(hdf5, metadata)
     assert data[1].duration == 4  # the other chunks are fine
     with pytest.raises(ValueError, match=rf"pairs\.h5: {NAME}/events\[2\]: damaged"):
@@ -302,16 +342,9 @@ def test_a_missing_compression_filter_names_the_plugin(tmp_path):
     hdf5, metadata = write_pairs(tmp_path)
     with h5py.File(hdf5, "r+") as file:
         del file[f"{NAME}/events"]
-        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        properties.set_chunk((1, 5, *SIZE))
-        properties.set_filter(32001, h5py.h5z.FLAG_OPTIONAL)
-        shape = (len(ROWS), 5, *SIZE)
-        dataset = h5py.h5d.create(
-            file[NAME].id, b"events", h5py.h5t.IEEE_F32LE, h5py.h5s.create_simple(shape), properties
-        )
-        dataset.write_direct_chunk((0, 0, 0, 0), b"compressed by something")
+    unknown_filter(hdf5, NAME, b"events", (len(ROWS), 5, *SIZE))
     data = ExtrapolationData(hdf5, metadata)
-    with pytest.raises(ValueError, match=r"compressed with filter 32001 .*hdf5plugin"):
+    with pytest.raises(ValueError, match=r"compressed with filter 32900 .*hdf5plugin"):
         data[0]
 
 
@@ -359,6 +392,31 @@ def test_impossible_depth_is_refused_when_it_is_read(tmp_path, value):
         data[3]
 
 
+def test_sequences_of_different_sizes_are_refused(tmp_path):
+    hdf5, metadata = write_pairs(tmp_path, [("train", NAME), ("train", "Town02_Opt_00")])
+    with h5py.File(hdf5, "r+") as file:
+        replaced("Town02_Opt_00/depth_frames", np.zeros((4, 1, 12, 16)))(file)
+        replaced("Town02_Opt_00/events", np.zeros((len(ROWS), 5, 12, 16)))(file)
+    with pytest.raises(
+        ValueError,
+        match=r"Town02_Opt_00/depth_frames: found shape .*12, 16\), expected \(6, 8\) images as in",
+    ):
+        ExtrapolationData(hdf5, metadata)
+
+
+def test_a_variable_row_of_another_length_is_refused_when_it_is_read(tmp_path):
+    hdf5, metadata = write_pairs(tmp_path)
+    with h5py.File(hdf5, "r+") as file:
+        del file[f"{NAME}/events"]
+        dataset = file.create_dataset(f"{NAME}/events", len(ROWS), h5py.vlen_dtype(np.float32))
+        for k in range(len(ROWS)):
+            dataset[k] = np.zeros(5 * SIZE[0] * SIZE[1] - (k == 1))
+    data = ExtrapolationData(hdf5, metadata)
+    data[0]
+    with pytest.raises(ValueError, match=r"events\[1\]: found 239 values, expected \(5, 6, 8\)"):
+        data[1]
+
+
 def test_voxel_grids_with_nan_are_refused(tmp_path):
     hdf5, metadata = write_pairs(tmp_path, dtype="f4")
     with h5py.File(hdf5, "r+") as file:
@@ -395,6 +453,10 @@ def test_one_broken_sequence_can_be_skipped_and_is_reported(tmp_path):
         ({"shortest_distance": np.array([0, 1, -1, 0])}, r"shortest_distance\[2\]: found -1.0"),
         ({"frames": np.zeros((4, 48))}, r"frames: found shape \(4, 48\), expected \(N, H, W\)"),
         ({"frames": np.zeros((4, *SIZE)).T}, "frames: found a column-major array"),
+        ({"frames": np.zeros((4, *SIZE), "S2")}, "frames: found a .*S2 array, expected row-major numbers"),
+        ({"frames": np.zeros((5, *SIZE))}, r"key_frame: found int64 \(4,\), expected 5 numbers"),
+        ({"shortest_distance": np.array([0, np.nan, 1, 0])}, r"shortest_distance\[1\]: found nan"),
+        ({"num_new_actors": np.array([0, 1, -1, 0])}, r"num_new_actors\[2\]: found -1"),
     ],
 )
 def test_raw_sequences_that_do_not_fit_are_refused(tmp_path, changes, message):
@@ -419,6 +481,45 @@ def test_a_truncated_raw_sequence_is_refused(tmp_path, share):
     path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(ValueError, match=r"raw\.npz: not a readable \.npz"):
         RawSequence(path)
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_flipped_bytes_in_a_raw_sequence_are_found_when_all_of_it_is_read(tmp_path, save):
+    """By the checksum of the archive, which covers all frames together."""
+    path = write_raw(tmp_path / "raw.npz")
+    with np.load(path) as arrays:
+        content = dict(arrays)
+    content["frames"] = np.random.default_rng(0).integers(-9, 9, (40, 60, 80)).astype(np.int16)
+    content |= {name: np.zeros(40) for name in content if name != "frames"}
+    save(path, **content)
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo("frames.npy")
+    whole = path.read_bytes()
+    for share in (0.3, 0.5, 0.7, 0.9):
+        path.write_bytes(whole)
+        flip(path, info.header_offset + 30 + int(share * info.compress_size))
+        raw = RawSequence(path)
+        with pytest.raises(ValueError, match=r"raw\.npz: frames\[\d+\]: damaged or truncated"):
+            for k in range(len(raw)):
+                raw.frame(k)
+
+
+@pytest.mark.parametrize("name", ["frames", "ego_velocity"])
+def test_a_raw_sequence_that_cannot_be_decompressed_is_refused(tmp_path, name):
+    path = tmp_path / "raw.npz"
+    rng = np.random.default_rng(0)
+    content = dict.fromkeys(("key_frame", "shortest_distance", "num_new_actors"), np.zeros(400))
+    frames = rng.integers(-9, 9, (400, *SIZE)).astype(np.int16)
+    np.savez_compressed(path, frames=frames, ego_velocity=rng.random(400), **content)
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo(f"{name}.npy")
+    middle = info.header_offset + info.compress_size // 2
+    whole = path.read_bytes()
+    path.write_bytes(whole[:middle] + b"\xff" * 200 + whole[middle + 200 :])
+    with pytest.raises(ValueError, match=rf"raw\.npz: {name}"):
+        raw = RawSequence(path)
+        for k in range(len(raw)):
+            raw.frame(k)
 
 
 # Finding the files of a folder.

@@ -4,6 +4,7 @@ import json
 import pickle
 import shutil
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -105,6 +106,21 @@ def test_an_example_holds_what_the_release_says(data, pairs):
     assert with_previous > 3
     with pytest.raises(ValueError, match="odometry: ELiDAR holds no poses"):
         training.example(0, odometry=True)
+
+
+def test_a_broken_sequence_can_be_left_out_and_is_named(tmp_path):
+    names = [f"Town0{k}_Opt_00" for k in range(3)]
+    hdf5, _ = write_pairs(tmp_path, [("train", name) for name in names])
+    with h5py.File(hdf5, "r+") as file:
+        del file[f"{names[0]}/depth_frames"]
+    files = find_files(tmp_path)
+    with pytest.raises(ValueError, match=f"{names[0]}/depth_frames: found nothing"):
+        open_elidar_pairs(files, ElidarOptions())
+    with pytest.warns(UserWarning, match=f"left out {names[0]}: .*depth_frames: found nothing"):
+        parts = open_elidar_pairs(files, ElidarOptions(on_error="skip"))
+    assert sorted(name for part in parts for name in part.data.sequences) == names[1:]
+    with pytest.raises(ValueError, match="on_error: found 'ignore'"):
+        ElidarOptions(on_error="ignore")
 
 
 def test_pairs_reach_a_worker_as_paths(pairs):

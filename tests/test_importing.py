@@ -4,9 +4,18 @@ import json
 import math
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
-from event_files import some_events, write_dat, write_depth, write_dsec, write_m3ed
+from event_files import (
+    driving_poses,
+    some_events,
+    write_dat,
+    write_depth,
+    write_dsec,
+    write_m3ed,
+    write_poses,
+)
 from gymnasium.utils.env_checker import check_env
 
 import nl_env
@@ -173,9 +182,37 @@ def test_event_files_are_inspected(tmp_path, writer):
     assert len(found.problems) == 1 and "found x = 64 at event 500" in found.problems[0]
 
 
+def test_ground_truth_is_inspected(tmp_path):
+    """Depth maps and poses of one file, a folder of both files, and what is wrong with them."""
+    times = np.arange(5) * 100_000 + 7_000.25
+    path = write_depth(tmp_path / "depth_gt.h5", np.full((5, 48, 64), 20.0), times)
+    (depth,) = inspect_path(path, Reading(verify=True, pictures=True))
+    assert depth.kind == "depth maps" and depth.problems == [] and len(depth.pictures) == 5
+    assert (depth.facts["resolution"], depth.facts["maps"], depth.facts["maps_per_second"]) == (
+        "48x64",
+        5,
+        10,
+    )
+    write_poses(path, driving_poses(times, 6.0), times, mode="r+", camera="/prophesee/right")
+    write_m3ed(tmp_path / "data.h5", some_events((48, 64), 200_000, 1_000), (48, 64))
+    events, depth, poses = inspect_path(tmp_path, Reading())
+    assert (events.kind, depth.kind, poses.kind) == ("M3ED events", "depth maps", "poses")
+    assert poses.facts["metres"] == pytest.approx(2.4) and poses.facts["largest_speed"] == pytest.approx(6.0)
+    json.dumps([found.as_json() for found in (events, depth, poses)], allow_nan=False)
+
+    with h5py.File(path, "r+") as file:
+        file["depth/prophesee/left"][3, 0, 0] = -1.0
+        file["Cn_T_C0"][2] = 0.0
+    (tmp_path / "broken.h5").write_bytes(path.read_bytes()[:2000])
+    events, depth, poses, broken = inspect_path(tmp_path, Reading(verify=True))
+    assert "depth/prophesee/left[3]: found -1.0 m" in depth.problems[0]
+    assert "Cn_T_C0[2]: found " in poses.problems[0]
+    assert "broken.h5: not a readable HDF5 file" in broken.problems[0] and events.problems == []
+
+
 def test_it_has_no_odometry(standard):
     recording = standard[2]
-    with pytest.raises(ValueError, match=r"odometry: found True, but .* holds no poses"):
+    with pytest.raises(ValueError, match=r"odometry: found True, but .* holds poses at 0 of 26 slices"):
         gym.make("nl_env/Replay-v0", data=recording.path, extrapolator="warp", odometry=True)
 
 

@@ -42,6 +42,26 @@ def change(path, name, content):
     return path
 
 
+def flip(path, name, chunk):
+    """Change a byte in the middle of a chunk of a dataset."""
+    with h5py.File(path) as file:
+        found = file[name].id.get_chunk_info(chunk)
+    data = bytearray(path.read_bytes())
+    data[found.byte_offset + found.size // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def unknown_filter(path, group, name, shape):
+    """Add a dataset of one chunk that nothing here can decompress."""
+    with h5py.File(path, "r+") as file:
+        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        properties.set_chunk(shape)
+        properties.set_filter(32_900, h5py.h5z.FLAG_OPTIONAL)  # a number that no package claims
+        space = h5py.h5s.create_simple(shape)
+        dataset = h5py.h5d.create(file[group].id, name, h5py.h5t.STD_U32LE, space, properties)
+        dataset.write_direct_chunk((0,) * len(shape), b"compressed by something")
+
+
 def late(ms):
     """A change of the index: the events of one millisecond are counted before it."""
 
@@ -196,11 +216,7 @@ def test_a_truncated_hdf5(tmp_path, share):
 
 def test_flipped_bytes_in_a_chunk(tmp_path):
     path = write_dsec(tmp_path / "a.h5", EVENTS, compression="gzip", fletcher32=True, chunks=(1_000,))
-    with h5py.File(path) as file:
-        chunk = file["events/x"].id.get_chunk_info(2)
-    data = bytearray(path.read_bytes())
-    data[chunk.byte_offset + chunk.size // 2] ^= 0xFF
-    path.write_bytes(data)
+    flip(path, "events/x", 2)
     source = MsIndexedEvents(path)
     assert len(source.events(0, 100_000))  # the other chunks are fine
     with pytest.raises(ValueError, match=r"a\.h5: events/x\[.*damaged or truncated"):
@@ -217,13 +233,7 @@ def test_a_file_without_events(tmp_path):
 
 def test_a_missing_filter_names_the_plugin(tmp_path):
     path = change(write_dsec(tmp_path / "a.h5", EVENTS), "events/t", None)
-    with h5py.File(path, "r+") as file:
-        properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        properties.set_chunk((len(EVENTS),))
-        properties.set_filter(32_900, h5py.h5z.FLAG_OPTIONAL)  # a number that no package claims
-        space = h5py.h5s.create_simple((len(EVENTS),))
-        dataset = h5py.h5d.create(file["events"].id, b"t", h5py.h5t.STD_U32LE, space, properties)
-        dataset.write_direct_chunk((0,), b"compressed by something")
+    unknown_filter(path, "events", b"t", (len(EVENTS),))
     with pytest.raises(ValueError, match=r"events/t: compressed with filter 32900 .*install hdf5plugin"):
         MsIndexedEvents(path)
 
@@ -274,8 +284,17 @@ def test_depth_maps(tmp_path):
         ("ts", [10, 20, 20], r"ts\[2\]: found 20 us, expected times that ascend"),
         ("ts", [10, 30, 20], r"ts\[2\]: found 20 us"),
         ("ts", [-10, 20, 30], r"ts\[0\]: found -10 us"),
+        ("ts", [0.1, 20.0, 20.3], r"ts\[2\]: found 20.3 us"),
+        ("ts", [1.0, np.nan, 3.0], r"ts\[1\]: found nan us"),
+        ("ts", [1.0, 2.0, np.inf], r"ts\[2\]: found inf us"),
+        ("ts", [1.0, 2.0, 1e300], r"ts\[2\]: found 1e\+300 us"),
+        ("ts", [True, False, True], r"ts: found bool \(3,\), expected times in us"),
         ("ts", [10, 20], r"expected \(N, H, W\) and \(N,\)"),
-        ("ts", [1.0, 2.0, 3.0], "expected integers, us"),
+        (
+            "depth/prophesee/left",
+            np.zeros((3, 2, 2), "S2"),
+            r"depth/prophesee/left: found \|S2, expected numbers",
+        ),
         ("ts", None, "ts: found nothing"),
         ("depth/prophesee/left", None, "depth/prophesee/left: found nothing"),
         ("depth/prophesee/left", np.zeros((3, 2)), r"found depth/prophesee/left \(3, 2\)"),
@@ -287,6 +306,33 @@ def test_bad_depth_files(tmp_path, name, content, message):
         DepthMaps(path)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_depth_file(tmp_path, share):
+    path = write_depth(tmp_path / "d.h5", np.ones((3, 20, 30)), [10, 20, 30])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"d\.h5: not a readable HDF5 file"):
+        DepthMaps(path)
+
+
+def test_flipped_bytes_in_a_depth_map(tmp_path):
+    depth = np.random.default_rng(0).uniform(1, 50, (3, 20, 30))
+    path = write_depth(tmp_path / "d.h5", depth, [10, 20, 30], compression="gzip")
+    flip(path, "depth/prophesee/left", 1)
+    maps = DepthMaps(path)
+    np.testing.assert_allclose(maps.read(2), depth[2], rtol=1e-6)
+    with pytest.raises(ValueError, match=r"d\.h5: depth/prophesee/left\[1\]: damaged or truncated"):
+        maps.read(1)
+
+
+def test_depth_compressed_with_a_missing_filter(tmp_path):
+    path = change(write_depth(tmp_path / "d.h5", np.ones((2, 2, 2)), [10, 20]), "depth/prophesee/left", None)
+    unknown_filter(path, "depth/prophesee", b"left", (2, 2, 2))
+    maps = DepthMaps(path)
+    with pytest.raises(ValueError, match=r"left: compressed with filter 32900 .*install hdf5plugin"):
+        maps.read(0)
+
+
 def test_negative_depth(tmp_path):
     maps = DepthMaps(write_depth(tmp_path / "d.h5", np.full((2, 2, 2), -1.5), [10, 20]))
     with pytest.raises(ValueError, match=r"depth/prophesee/left\[1\]: found -1.5 m"):
@@ -295,13 +341,19 @@ def test_negative_depth(tmp_path):
 
 # Prophesee
 
+WRITERS = [write_dat, write_evt2, pytest.param(write_evt3, marks=needs_evt3)]
 
-@pytest.mark.parametrize("writer", [write_dat, write_evt2, pytest.param(write_evt3, marks=needs_evt3)])
+
+def write_prophesee(writer, folder, events):
+    if writer is write_dat:
+        return write_dat(folder / "a.dat", events, DSEC_SHAPE)
+    return writer(folder / "a.raw", events)
+
+
+@pytest.mark.parametrize("writer", WRITERS)
 def test_prophesee_files(tmp_path, writer):
     events = some_events((480, 640), 300_000, 3_000, seed=2, start_us=17_000_000)  # past 24 bits of us
-    suffix = ".dat" if writer is write_dat else ".raw"
-    arguments = (DSEC_SHAPE,) if writer is write_dat else ()
-    source = open_events(writer(tmp_path / f"a{suffix}", events, *arguments))
+    source = open_events(write_prophesee(writer, tmp_path, events))
     assert source.shape == (480, 640)
     assert source.span() == (events["t"][0], events["t"][-1])
     for start, stop in [(0, 10**9), (17_050_000, 17_123_456), (0, 17_000_000)]:
@@ -349,16 +401,47 @@ def test_the_caller_may_say_the_size(tmp_path):
         open_events(path, sensor=(480, 32)).verify()
 
 
-@pytest.mark.parametrize("writer", [write_dat, write_evt2, pytest.param(write_evt3, marks=needs_evt3)])
+@pytest.mark.parametrize("writer", WRITERS)
 def test_truncated_prophesee_files(tmp_path, writer):
-    path = writer(
-        tmp_path / f"a.{'dat' if writer is write_dat else 'raw'}",
-        EVENTS,
-        *[DSEC_SHAPE][: writer is write_dat],
-    )
+    path = write_prophesee(writer, tmp_path, EVENTS)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(ValueError, match="cut off"):
         open_events(path).span()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_prophesee_file_cut_between_two_words_is_a_shorter_one(tmp_path, writer, share):
+    """Nothing in it says how long it was; what is left is right."""
+    path = write_prophesee(writer, tmp_path, EVENTS)
+    whole = path.read_bytes()
+    removed = 8 * int((1 - share) * (len(whole) - 200) / 8 + 1)
+    path.write_bytes(whole[:-removed])
+    found = np.concatenate(list(open_events(path).blocks(0, 10**9)))
+    assert 0 < len(found) < len(EVENTS)
+    np.testing.assert_array_equal(found, EVENTS[: len(found)])
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize(("name", "value", "last"), [("x", 700, 639), ("y", 500, 479)])
+def test_events_off_the_sensor(tmp_path, writer, name, value, last):
+    events = EVENTS.copy()
+    events[name][3_000] = value
+    source = open_events(write_prophesee(writer, tmp_path, events))
+    with pytest.raises(ValueError, match=rf"found {name} = {value} at event 3000, expected 0 to {last}"):
+        source.verify()
+
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_times_that_go_back(tmp_path, writer):
+    events = some_events(DSEC_SHAPE, 4_000, 40)  # all within what EVT 3.0's lower words can say
+    events["t"][:] = 100 * np.arange(40)
+    events["t"][20] = 2_150
+    source = open_events(write_prophesee(writer, tmp_path, events))
+    with pytest.raises(
+        ValueError, match=r"found t = 2100 at event 21, expected no time before that of the prev"
+    ):
+        source.span()
 
 
 def test_bad_dat_files(tmp_path):

@@ -261,6 +261,51 @@ def test_what_does_not_fit_elidar_is_refused(elidar, bare, tmp_path):
         ReplayEnv(data=next(bare.glob("*.h5")))
 
 
+@pytest.mark.parametrize(("gone", "missing"), [(0, "voxel_grids_v1.h5"), (1, "voxel_grids_v1_metadata.csv")])
+def test_half_of_the_files_cannot_be_replayed(tmp_path, gone, missing):
+    files = write_pairs(tmp_path)
+    files[gone].unlink()
+    with pytest.raises(FileNotFoundError, match=f"found no .*{missing}, found only .*{files[1 - gone].name}"):
+        ReplayEnv(data=tmp_path)
+
+
+def test_broken_sequences_can_be_left_out_and_are_named(tmp_path):
+    hdf5, _ = write_pairs(tmp_path, [("train", "Town01_Opt_00"), ("train", "Town02_Opt_00")], dtype="f4")
+    with h5py.File(hdf5, "r+") as file:
+        del file["Town02_Opt_00/events"]
+    with pytest.raises(ValueError, match="Town02_Opt_00/events: found nothing"):
+        ReplayEnv(data=tmp_path)
+    with pytest.warns(UserWarning, match="left out Town02_Opt_00: .*Town02_Opt_00/events: found nothing"):
+        env = ReplayEnv(data=tmp_path, on_error="skip", extrapolator="repeat")
+    assert env.found.startswith("1 ELiDAR sequences")
+    env.reset(seed=0)
+    env.step(1)
+    with pytest.raises(ValueError, match="on_error: found 'ignore'"):
+        ReplayEnv(data=tmp_path, on_error="ignore")
+
+
+def test_labels_that_cannot_be_read_can_be_left_out_and_are_named(tmp_path):
+    write_pairs(tmp_path, dtype="f4")
+    (tmp_path / "Town01_Opt_00.npz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(ValueError, match=r"Town01_Opt_00\.npz: not a readable \.npz"):
+        ElidarStream(tmp_path).reset(0)
+    stream = ElidarStream(tmp_path, on_error="skip")
+    with pytest.warns(UserWarning, match=r"Town01_Opt_00 has no labels: .*not a readable \.npz"):
+        sample = stream.reset(0)
+    assert sample.state.speed == UNKNOWN_SPEED and not stream.describe()["labels"]
+
+
+def test_damaged_files_beside_recordings_can_be_left_out_and_are_named(recordings, tmp_path):
+    whole = (recordings / f"{TRAIN}.h5").read_bytes()
+    (tmp_path / f"{TRAIN}.h5").write_bytes(whole)
+    (tmp_path / f"{TEST}.h5").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=rf"{TEST}\.h5: not a readable HDF5 file"):
+        ReplayEnv(data=tmp_path)
+    with pytest.warns(UserWarning, match=rf"left out .*{TEST}\.h5: not a readable HDF5 file"):
+        env = ReplayEnv(data=tmp_path, on_error="skip")
+    assert env.found == "1 recordings"
+
+
 def test_damage_met_in_a_replay_is_named(tmp_path):
     hdf5, _ = write_pairs(tmp_path, dtype="f4")
     with h5py.File(hdf5, "r+") as file:

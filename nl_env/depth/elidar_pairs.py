@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.config import number
+from nl_env.config import choice, number
 from nl_env.depth.examples import Example
 from nl_env.depth.features import Scene
 from nl_env.depth.motion import continued, estimate_motion
-from nl_env.elidar import ElidarFiles, ExtrapolationData, previous_frame, read_metadata
+from nl_env.elidar import ElidarFiles, ExtrapolationData, previous_frame
 from nl_env.elidar.layout import RANGE
+from nl_env.elidar.metadata import ON_ERROR, warn_of
 from nl_env.recording.cut_set import CutSet, cut
 from nl_env.types import TICK_US, Camera
 
@@ -41,11 +42,14 @@ class ElidarOptions:
     """Horizontal field of view, degrees, which the files do not say."""
     max_depth: float = RANGE
     """Range, m: 200 outdoors, 9 indoors."""
+    on_error: str = "raise"
+    """raise, or skip: broken sequences are left out, with a warning for each."""
 
     def __post_init__(self) -> None:
         number("held_out", self.held_out, 0.001, 0.5)
         number("fov", self.fov, 20.0, 120.0)
         number("max_depth", self.max_depth, 0.1, 10_000.0)
+        choice("on_error", self.on_error, ON_ERROR)
 
 
 def held_out(names: Sequence[str], share: float) -> list[str]:
@@ -208,16 +212,23 @@ def open_elidar_pairs(
         FileNotFoundError, ValueError: as :class:`nl_env.elidar.ExtrapolationData`, or too few sequences.
     """
     hdf5, metadata = files.require_pairs()
-    names = [pairs.name for pairs in read_metadata(metadata).sequences if pairs.split == "train"]
+    every = ExtrapolationData(
+        hdf5, metadata, split="train", max_depth=options.max_depth, on_error=options.on_error
+    )
+    warn_of(every.problems)
+    names = list(every.sequences)
     chosen = held_out(names, options.held_out)
     parts = ([name for name in names if name not in chosen], chosen)
     found = None
     if motions is not None:
-        every = ExtrapolationData(hdf5, metadata, split="train", max_depth=options.max_depth)
         found = find_last_motions(every, options.fov, motions, workers=workers, progress=progress)
     training, validation = (
         ElidarPairs(
-            ExtrapolationData(hdf5, metadata, sequences=part, max_depth=options.max_depth), options.fov, found
+            ExtrapolationData(
+                hdf5, metadata, sequences=part, max_depth=options.max_depth, on_error=options.on_error
+            ),
+            options.fov,
+            found,
         )
         for part in parts
     )

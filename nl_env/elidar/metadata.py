@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,12 @@ class Problem:
 
     sequence: str
     message: str
+
+
+def warn_of(problems: Iterable[Problem]) -> None:
+    """One warning for each sequence that was left out, with the reason."""
+    for problem in problems:
+        warnings.warn(f"left out {problem.sequence}: {problem.message}", stacklevel=3)
 
 
 @dataclass(frozen=True, eq=False)

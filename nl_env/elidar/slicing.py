@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -16,6 +17,8 @@ from nl_env.elidar.layout import RAW_ARRAYS, SPLITS
 from nl_env.keyframes import DISTANCE_LIMIT, SPEED_LIMIT
 
 INT16 = np.iinfo(np.int16)
+UNREADABLE = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading a damaged member of an archive may raise."""
 
 
 class EventFrames:
@@ -188,7 +191,7 @@ class RawSequence:
         try:
             member.seek(self._start + index * size)
             content = member.read(size)
-        except (OSError, EOFError, zipfile.BadZipFile, ValueError) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{self.path}: frames[{index}]: damaged or truncated ({error})") from error
         if len(content) != size:
             raise ValueError(f"{self.path}: frames[{index}]: found {len(content)} bytes, expected {size}")
@@ -230,7 +233,7 @@ class RawSequence:
         try:
             with self._archive.open(f"{name}.npy") as file:
                 array = np.lib.format.read_array(file, allow_pickle=False)
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise ValueError(f"{self.path}: {name}: cannot be read ({error})") from error
         if array.size != self._length or array.dtype.kind not in "iufb":
             raise ValueError(
@@ -254,7 +257,7 @@ def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[
             np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         )
         shape, column_major, dtype = read(file)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ValueError(f"{path}: frames: cannot be read ({error})") from error
     if dtype.kind not in "iufb" or column_major:
         what = "column-major" if column_major else str(dtype)

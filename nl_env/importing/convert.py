@@ -1,4 +1,4 @@
-"""Writes a native recording from an event file, and from depth maps where there are some."""
+"""Writes a native recording from an event file, and from depth maps and poses where there are some."""
 
 from __future__ import annotations
 
@@ -14,63 +14,23 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.config import SPLITS, DrivingConfig, LidarConfig, SceneConfig, choice, number
-from nl_env.importing.depth_maps import DepthMaps
+from nl_env.config import SPLITS, DrivingConfig, LidarConfig, SceneConfig
 from nl_env.importing.geometry import Crop, choose_crop
-from nl_env.importing.source import EventSource
+from nl_env.importing.navigation import NavigationTrack
+from nl_env.importing.options import ImportOptions
+from nl_env.importing.poses import Motion, PoseTrack
+from nl_env.importing.source import DepthSource, EventSource
+from nl_env.keyframes import SPEED_LIMIT
 from nl_env.recording.schema import EVENT_FIELDS, LIBVER, Header
 from nl_env.recording.writer import CheckedOutput, DatasetWriter, DeferredInterrupts
 from nl_env.runs import replacing
 from nl_env.sensors.lidar import encode
-from nl_env.types import RESOLUTIONS, SLICE_US, TICK_US, TICKS_PER_SLICE
+from nl_env.types import SLICE_US, TICK_US, TICKS_PER_SLICE
 
 UNKNOWN_SPEED = -1.0
 """As on ELiDAR without its raw sequences."""
-MAX_TOLERANCE_MS = 9.9
-"""Below half a slice, so that no depth map serves two."""
 FIRST_SEED = SPLITS["test"].start + 100_000_000
 """Imported recordings are test sequences unless told otherwise, and far from the benchmark's."""
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """Which part of a file becomes a recording, and how.
-
-    Attributes:
-        resolution: full (480x640), half (240x320) or quarter (120x160).
-        start_s: begin this long after the first event; with depth, at the first map from there on.
-        duration_s: length, s.
-        crop: left, top, width and height in pixels of the sensor, a multiple of the resolution; None takes
-            the largest that fits, centred.
-        focal_px: focal length in pixels of the sensor; None takes the file's calibration.
-        max_depth: range, m; depth beyond is no return.
-        lidar_hz: LiDAR frames per second.
-        depth_tolerance_ms: how far from a slice's end its depth map may be.
-        seed: of the recording; None derives one from the file's name and start_s.
-    """
-
-    resolution: str = "quarter"
-    start_s: float = 0.0
-    duration_s: float = 20.0
-    crop: tuple[int, int, int, int] | None = None
-    focal_px: float | None = None
-    max_depth: float = 200.0
-    lidar_hz: int = 5
-    depth_tolerance_ms: float = 5.0
-    seed: int | None = None
-
-    def __post_init__(self) -> None:
-        choice("resolution", self.resolution, tuple(RESOLUTIONS))
-        number("start_s", self.start_s, 0.0, 1e6)
-        number("depth_tolerance_ms", self.depth_tolerance_ms, 0.0, MAX_TOLERANCE_MS)
-        SceneConfig(duration_s=self.duration_s)
-        LidarConfig(self.lidar_hz, self.max_depth)
-        if self.focal_px is not None:
-            number("focal_px", self.focal_px, 1.0, 1e5)
-        if self.seed is not None and not any(self.seed in seeds for seeds in SPLITS.values()):
-            raise ValueError(
-                f"seed: found {self.seed!r}, expected an integer from 0 to {SPLITS['test'].stop - 1}"
-            )
 
 
 @dataclass(frozen=True)
@@ -85,6 +45,8 @@ class Imported:
         events_kept: those in the crop.
         depth_slices: how many of the K + 1 slice ends have a depth map.
         depth_offset_ms: largest time between a slice's end and its depth map.
+        pose_slices: how many of the slice ends have a pose.
+        speed_slices: how many of them have a speed.
     """
 
     seed: int
@@ -94,31 +56,42 @@ class Imported:
     events_kept: int
     depth_slices: int
     depth_offset_ms: float
+    pose_slices: int
+    speed_slices: int
 
 
 def import_recording(
-    source: EventSource, depth: DepthMaps | None, path: Path, options: ImportOptions
+    source: EventSource,
+    depth: DepthSource | None,
+    path: Path,
+    options: ImportOptions,
+    track: PoseTrack | NavigationTrack | None = None,
 ) -> Imported:
     """Write a recording of ``source`` to ``path``, whole or not at all.
 
     The end of every slice that has a depth map within the tolerance gets that map. All others get an empty
     one (no return anywhere), as do all without ``depth``: nothing is interpolated. LiDAR frames must not be
-    empty, so each needs a map.
+    empty, so each needs a map. With ``track`` every slice's end has the speed, the first cause of a keyframe
+    and, of poses, pose and twist, as far as the track reaches; the rest of the state is not known.
 
     Args:
         source: the events.
         depth: depth maps of the same sensor on the same clock, or None.
         path: the recording; replaced if it exists.
         options: which part, and how.
+        track: poses of the camera or its speed on the same clock, or None.
 
     Raises:
-        ValueError: an option, damage in a file, or too little of events or depth; names which.
+        ValueError: an option, damage in a file, or too little of events, depth or poses; names which.
         OSError: the recording cannot be written; the message names it.
     """
     crop = choose_crop(source.shape, options.resolution, source.calibration, options.crop)
     config = _config(source, crop, options)
     start = _start(source, depth, config.scene.slices, options)
     maps, offset_us = _matched(depth, start, config, options)
+    motion = _motion(track, start, config.scene.slices)
+    with_pose = int(np.count_nonzero(motion.known))
+    with_speed = int(np.count_nonzero(np.isfinite(motion.speed)))
     seed = derived_seed(source.path.name, options.start_s) if options.seed is None else options.seed
     with_depth = int(np.count_nonzero(maps >= 0))
     description = {
@@ -134,6 +107,9 @@ def import_recording(
         "depth_source": None if depth is None else depth.path.name,
         "depth_slices": with_depth,
         "depth_offset_us": offset_us,
+        "motion_source": None if track is None else track.path.name,
+        "pose_slices": with_pose,
+        "speed_slices": with_speed,
     }
     header = Header(seed, config, description)
     with _writing(path, header) as writer:
@@ -144,8 +120,10 @@ def import_recording(
                 metres = crop.depth(depth.read(index))
             writer.append("depth/codes", encode(metres, options.max_depth)[None])
             writer.append("depth/t", [k * SLICE_US])
-        _write_unknown_state(header.slices + 1, writer)
-    return Imported(seed, header.slices, crop, read, kept, with_depth, offset_us / 1000)
+        _write_state(motion, writer)
+    return Imported(
+        seed, header.slices, crop, read, kept, with_depth, offset_us / 1000, with_pose, with_speed
+    )
 
 
 def derived_seed(name: str, start_s: float) -> int:
@@ -170,7 +148,7 @@ def _config(source: EventSource, crop: Crop, options: ImportOptions) -> DrivingC
     )
 
 
-def _start(source: EventSource, depth: DepthMaps | None, slices: int, options: ImportOptions) -> int:
+def _start(source: EventSource, depth: DepthSource | None, slices: int, options: ImportOptions) -> int:
     """Time of slice 0, us; raises ``ValueError`` unless events last for ``slices`` from there."""
     first, last = source.span()
     start = first + round(options.start_s * 1e6)
@@ -195,7 +173,7 @@ def _start(source: EventSource, depth: DepthMaps | None, slices: int, options: I
 
 
 def _matched(
-    depth: DepthMaps | None, start: int, config: DrivingConfig, options: ImportOptions
+    depth: DepthSource | None, start: int, config: DrivingConfig, options: ImportOptions
 ) -> tuple[NDArray[np.int64], int]:
     """The depth map of each slice's end, -1 for none, and the largest time between the two, us."""
     ends = start + SLICE_US * np.arange(config.scene.slices + 1)
@@ -218,6 +196,20 @@ def _matched(
             "give another --lidar-hz, --start-s, --duration-s or --depth-tolerance-ms"
         )
     return np.where(found, maps, -1), int(offsets[found].max())
+
+
+def _motion(track: PoseTrack | NavigationTrack | None, start: int, slices: int) -> Motion:
+    """The motion at every slice's end; raises ``ValueError`` where a track says nothing of any."""
+    ends = start + SLICE_US * np.arange(slices + 1)
+    if track is None:
+        return Motion.unknown(len(ends))
+    motion = track.motion(ends)
+    if not np.isfinite(motion.speed).any():
+        raise ValueError(
+            f"{track.path}: found poses or speeds from {track.times[0]} to {track.times[-1]} us, "
+            f"expected some from {ends[0]} to {ends[-1]} us"
+        )
+    return motion
 
 
 class _Writer:
@@ -279,12 +271,15 @@ def _write_events(
     return read, int(index[-1])
 
 
-def _write_unknown_state(rows: int, writer: _Writer) -> None:
-    """What no sensor here says: motion, speed, other actors, and so no keyframe either."""
-    writer.append("depth/pose", np.full((rows, 4, 4), math.nan))
-    writer.append("depth/twist", np.full((rows, 6), math.nan))
-    writer.append("state/speed", np.full(rows, UNKNOWN_SPEED))
+def _write_state(motion: Motion, writer: _Writer) -> None:
+    """The motion where it is known; nothing here says other actors, and so no keyframe that they cause."""
+    rows = len(motion.speed)
+    speed = np.where(np.isfinite(motion.speed), motion.speed, UNKNOWN_SPEED)
+    writer.append("depth/pose", motion.pose)
+    writer.append("depth/twist", motion.twist)
+    writer.append("state/speed", speed)
     writer.append("state/shortest_distance", np.full(rows, math.inf))
     writer.append("state/new_actors", np.zeros(rows, np.int64))
-    for cause in ("speed", "distance", "new"):
+    writer.append("state/keyframe_speed", speed > SPEED_LIMIT)
+    for cause in ("distance", "new"):
         writer.append(f"state/keyframe_{cause}", np.zeros(rows, np.bool_))

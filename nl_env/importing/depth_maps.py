@@ -4,21 +4,44 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.config import choice
 from nl_env.elidar.hdf5 import Hdf5Reader
 from nl_env.importing.ms_indexed import CAMERAS, load_filters
+from nl_env.importing.source import checked_times
 
 TIMES = "ts"
+PLAIN = "depth"
+"""The maps of a file that is not M3ED's."""
+
+
+def depth_in(path: Path) -> tuple[str, ...]:
+    """The cameras that :class:`DepthMaps` finds maps of in an HDF5 file; plain ``depth`` is the left's.
+
+    Raises:
+        FileNotFoundError, ValueError: a missing or unreadable HDF5 file.
+    """
+    with Hdf5Reader(path) as reader:
+        found = tuple(
+            camera for camera in CAMERAS if isinstance(reader.file.get(_name(camera)), h5py.Dataset)
+        )
+        plain = isinstance(reader.file.get(PLAIN), h5py.Dataset) and TIMES in reader.file
+    return found or CAMERAS[: int(plain)]
+
+
+def _name(camera: str) -> str:
+    """Where M3ED keeps a camera's maps."""
+    return f"depth/prophesee/{camera}"
 
 
 class DepthMaps:
     """``depth/prophesee/CAMERA`` and ``ts`` of an M3ED depth file, or plain ``depth`` and ``ts``.
 
-    Depth is z-depth in metres at the pixels of the event camera, times are us on the events' clock. Read
-    map by map.
+    A :class:`nl_env.importing.DepthSource`. Depth is z-depth in metres at the pixels of the event camera,
+    times are us on the events' clock, integers or (in M3ED) floats. Read map by map.
 
     Args:
         path: the HDF5 file.
@@ -38,26 +61,18 @@ class DepthMaps:
         self.path = Path(path)
         load_filters()
         self._reader = Hdf5Reader(self.path)
-        names = (f"depth/prophesee/{camera}", "depth")
-        file = self._reader.file
-        self._name = next((name for name in names if name in file and hasattr(file[name], "shape")), names[0])
+        plain = isinstance(self._reader.file.get(PLAIN), h5py.Dataset)
+        self._name = PLAIN if plain else _name(camera)
         depth, times = self._reader.dataset(self._name), self._reader.dataset(TIMES)
         if depth.ndim != 3 or times.shape != depth.shape[:1] or len(depth) == 0:
             raise ValueError(
                 f"{self.path}: found {self._name} {depth.shape} and {TIMES} {times.shape}, "
                 "expected (N, H, W) and (N,)"
             )
-        if times.dtype.kind not in "iu":
-            raise ValueError(f"{self.path}: {TIMES}: found {times.dtype}, expected integers, us")
         self.shape: tuple[int, int] = (int(depth.shape[1]), int(depth.shape[2]))
-        self.times: NDArray[np.int64] = self._reader.read(TIMES, slice(None)).astype(np.int64)
-        wrong = np.diff(self.times, prepend=-1) <= 0  # a negative time, too
-        if wrong.any():
-            k = int(np.argmax(wrong))
-            raise ValueError(
-                f"{self.path}: {TIMES}[{k}]: found {self.times[k]} us, "
-                "expected times that ascend from 0 without repeating"
-            )
+        self.times: NDArray[np.int64] = checked_times(
+            f"{self.path}: {TIMES}", self._reader.read(TIMES, slice(None))
+        )
 
     def __len__(self) -> int:
         return len(self.times)

@@ -1,4 +1,4 @@
-"""Which reader an event file needs."""
+"""Which reader a file of events or of depth needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 
 from nl_env.elidar.hdf5 import Hdf5Reader
 from nl_env.elidar.layout import HDF5_SUFFIXES
+from nl_env.importing.depth_maps import DepthMaps
+from nl_env.importing.dsec import DisparityMaps, StereoCalibration
 from nl_env.importing.ms_indexed import CAMERAS, MsIndexedEvents, find_layout
 from nl_env.importing.prophesee import DatEvents, Evt2Events, Evt3Events, open_raw
 
@@ -38,6 +40,29 @@ def open_events(path: Path, camera: str = "left", sensor: tuple[int, int] | None
         return DatEvents(path, sensor)
     known = ", ".join((*HDF5_SUFFIXES, *EVENT_SUFFIXES))
     raise ValueError(f"{path}: found {suffix or 'no suffix'}, expected one of {known}")
+
+
+def open_depth(
+    path: Path, camera: str = "left", calibration: StereoCalibration | None = None
+) -> DepthMaps | DisparityMaps:
+    """The depth maps of an HDF5 file, or DSEC's disparity in a folder.
+
+    Args:
+        path: the file or folder.
+        camera: ``"left"`` or ``"right"``, where a file may hold both.
+        calibration: of DSEC; a folder needs it.
+
+    Raises:
+        FileNotFoundError: nothing there, or half of it.
+        ValueError: damage, a folder without a calibration, or disparity for the right camera.
+    """
+    if not path.is_dir():
+        return DepthMaps(path, camera)
+    if calibration is None:
+        raise ValueError(f"{path}: found a folder, DSEC's disparity, expected its --calibration, too")
+    if camera != "left":
+        raise ValueError(f"camera: found {camera!r}, but DSEC's disparity ({path}) is the left camera's")
+    return DisparityMaps(path, calibration)
 
 
 def cameras_in(path: Path) -> tuple[str, ...]:

@@ -67,6 +67,60 @@ class EventSource(Protocol):
         ...
 
 
+class DepthSource(Protocol):
+    """Depth maps of the event camera, with times.
+
+    Attributes:
+        path: the file or folder.
+        shape: ``(H, W)``, that of the events.
+        times: ``(N,)`` int64, us on the events' clock, ascending.
+    """
+
+    path: Path
+    shape: tuple[int, int]
+    times: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of maps."""
+        ...
+
+    def read(self, k: int) -> NDArray[np.float32]:
+        """``(H, W)`` float32 m along the optical axis, map ``k``; 0 = no return.
+
+        Raises:
+            ValueError: damage, with the file and what is wrong with it.
+        """
+        ...
+
+    def close(self) -> None:
+        """Release the file; may be called twice."""
+        ...
+
+
+def checked_times(where: str, values: NDArray[Any]) -> NDArray[np.int64]:
+    """``(N,)`` times as int64 us; fractions of one are rounded, as M3ED stores them.
+
+    Args:
+        where: file and dataset that messages name.
+        values: integers or floats.
+
+    Raises:
+        ValueError: none, another rank or type, not finite, negative, or not ascending.
+    """
+    if values.ndim != 1 or len(values) == 0 or values.dtype.kind not in "iuf":
+        raise ValueError(f"{where}: found {values.dtype} {values.shape}, expected times in us, at least one")
+    wrong = ~np.isfinite(values) | (values < 0) | (values >= 2.0**62)
+    if not wrong.any():
+        times = np.rint(values).astype(np.int64) if values.dtype.kind == "f" else values.astype(np.int64)
+        wrong = np.diff(times, prepend=-1) <= 0
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        raise ValueError(
+            f"{where}[{k}]: found {values[k]} us, expected times that ascend from 0 without repeating"
+        )
+    return times
+
+
 class EventChecker:
     """Turns raw columns into ``EVENT_DTYPE``, one block after the other, and refuses what cannot be events.
 

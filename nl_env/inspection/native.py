@@ -27,9 +27,7 @@ def inspect_recordings(paths: Sequence[Path], where: Path, reading: Reading) -> 
                 if reading.verify:
                     recording.verify()
                 if reading.pictures and len(found.pictures) < 2 * TILES:
-                    k = recording.slices // 2
-                    events_then = recording.bins(k).sum(axis=0)
-                    found.add_picture(recording.depth(k * SLICE_US), events_then, recording.max_depth)
+                    _add_picture(found, recording)
                 counted = int(recording.event_counts.sum())
                 labelled = int(recording.keyframe[1:].sum())
                 length, description = recording.slices, recording.description
@@ -70,6 +68,17 @@ def inspect_weights(path: Path) -> Findings:
     if card is not None:
         found.facts |= {name: value for name, value in asdict(card).items() if value}
     return found
+
+
+def _add_picture(found: Findings, recording: Recording) -> None:
+    """Depth and events of the LiDAR frame in the middle; of real sensors others may be empty, or all."""
+    period = recording.config.lidar.period
+    k = max(recording.slices // 2 // period, 1) * period
+    depth, events = recording.depth(k * SLICE_US), recording.bins(k).sum(axis=0)
+    if depth.any():
+        found.add_picture(depth, events, recording.max_depth)
+    else:
+        found.add_events(events)
 
 
 def _kind(recording: Recording) -> str:
