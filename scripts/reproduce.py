@@ -282,7 +282,7 @@ class TableEndToEnd:
         ours = methods[-1].row
         sections = end_to_end_sections(figures, self.reference, ours)
         if ours == OURS:
-            targets = end_to_end_targets(figures, self.reference, ours, job.resolution)
+            targets = end_to_end_targets(figures, policies.detectors, ours, job.resolution)
             sections += target_section(targets)
         print(job.publish(sections, figures, command, notes))
 

@@ -83,16 +83,21 @@ def keyframe_targets(found: KeyframeFigures, frame: str, temporal: str) -> list[
     return targets
 
 
-def end_to_end_targets(found: EndToEnd, reference: str, ours: str, resolution: str) -> list[Target]:
-    """Targets of the detector ``reference`` with the extrapolator ``ours``."""
+def end_to_end_targets(found: EndToEnd, detectors: Iterable[str], ours: str, resolution: str) -> list[Target]:
+    """Targets of the keyframe ``detectors`` with the extrapolator ``ours``."""
     limit = HELD_QUARTER if resolution == "quarter" else HELD_LARGER
     held = {policy: by[ours][DECIDING_METRIC] for policy, by in found.held.items()}
     once = min(figure.mean for policy, figure in held.items() if policy.startswith("once"))
-    return [
-        Target(f"{reference}: mean rate, Hz", found.policies[reference].rate.mean, 0.0, MOST_HZ),
-        Target(f"{reference}: change of held {DECIDING_METRIC}", held[reference].change, -1.0, limit),
-        Target("always against once per interval, best slice", held["always"].mean / once - 1, -1.0, 0.0),
-    ]
+    targets = []
+    for name in detectors:
+        targets += [
+            Target(f"{name}: mean rate, Hz", found.policies[name].rate.mean, 0.0, MOST_HZ),
+            Target(f"{name}: change of held {DECIDING_METRIC}", held[name].change, -1.0, limit),
+        ]
+    decided = Target(
+        "always against once per interval, best slice", held["always"].mean / once - 1, -1.0, 0.0
+    )
+    return [*targets, decided]
 
 
 def target_section(targets: list[Target]) -> list[Section]:
