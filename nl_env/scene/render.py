@@ -1,6 +1,7 @@
 """Software renderer: pixel-aligned intensity and z-depth of parallelograms over a painted ground plane.
 
-One frame is: cull objects, project their quads and rasterise (``raster``), shade and blur (``shading``).
+One frame is: cull objects and project their quads (``listing``), rasterise (``raster``), shade and blur
+(``shading``).
 Grey levels are gamma-coded throughout (products of powers are powers of products), so no power is taken
 per pixel.
 """
@@ -13,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from nl_env.scene import raster, shading
+from nl_env.scene import listing, raster, shading
+from nl_env.scene.lanes import LANES
 from nl_env.scene.quads import Objects, Quads
 from nl_env.scene.raster import FAST
 from nl_env.scene.textures import Textures, halve, load, pack
@@ -82,33 +84,26 @@ class Light(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """Working memory of one renderer: frame buffers, the draw list, and one row of shading scratch."""
+    """Working memory of one renderer: frame buffers (with spare columns), the draw list, one row to blur."""
 
     inverse_depth: NDArray[np.float32]
     indices: NDArray[np.int32]
     shade: NDArray[np.float32]
     table: NDArray[np.float64]
     visible: NDArray[np.int32]
-    at: NDArray[np.uint32]
-    texel: NDArray[np.int32]
-    fa: NDArray[np.float32]
-    fb: NDArray[np.float32]
-    gain: NDArray[np.float32]
-    bias: NDArray[np.float32]
+    row: NDArray[np.float32]
 
     @classmethod
     def allocate(cls, camera: Camera, quads: int, objects: int) -> Buffers:
         """For scenes of at most ``quads`` parallelograms in ``objects`` objects."""
-        row = [np.zeros(camera.width, np.float32) for _ in range(4)]
+        frame = (camera.height, camera.width + LANES)
         return cls(
-            np.zeros(camera.shape, np.float32),
-            np.zeros(camera.shape, np.int32),
-            np.zeros(camera.shape, np.float32),
+            np.zeros(frame, np.float32),
+            np.full(frame, raster.OUTSIDE, np.int32),
+            np.zeros(frame, np.float32),
             np.zeros((max(quads, 1), raster.COLUMNS), np.float64),
             np.zeros(max(objects, 1), np.int32),
-            np.zeros(camera.width, np.uint32),
-            np.zeros(camera.width, np.int32),
-            *row,
+            np.zeros(camera.width, np.float32),
         )
 
 
@@ -119,20 +114,19 @@ def render_frame(
 ):  # fmt: skip
     """Render one frame into ``intensity`` and, when asked for, ``depth``."""
     inverse_depth, index, shade, table = buffers.inverse_depth, buffers.indices, buffers.shade, buffers.table
-    visible, at, texel = buffers.visible, buffers.at, buffers.texel
-    fa, fb, gain, bias = buffers.fa, buffers.fb, buffers.gain, buffers.bias
+    visible = buffers.visible
     fx, fy, cx, cy = lens
-    height, width = index.shape
+    height, width = intensity.shape
     # Ground plane z = 0: 1 / depth is the ray's downward slope over the camera's height.
     gx = -rotation[2, 0] / fx / eye[2]
     gy = -rotation[2, 1] / fy / eye[2]
     g0 = -rotation[2, 2] / eye[2] - gx * cx - gy * cy
     used = 0
     for quads, objects in ((static, static_objects), (moving, moving_objects)):
-        count = raster.cull_objects(
+        count = listing.cull_objects(
             objects.centre, objects.radius, rotation, eye, lens, width, height, SEEN, visible
         )
-        used = raster.list_quads(
+        used = listing.list_quads(
             quads,
             visible,
             count,
@@ -151,14 +145,13 @@ def render_frame(
     band = max(8, BAND_PIXELS // width)
     for first in range(0, height, band):
         last = min(first + band, height)
-        raster.clear(inverse_depth, index, first, last, g0, gx, gy)
-        raster.rasterise(first, last, used, table, textures.cutouts, inverse_depth, index, at, texel)
+        raster.clear(inverse_depth, index, first, last, width, g0, gx, gy)
+        raster.rasterise(first, last, used, table, textures.cutouts, inverse_depth, index)
         shading.shade_rows(
-            first, last, rotation, eye, lens, table, textures.packed, textures.offsets, ground.packed,
-            ground.layout, ground.corner, ground.texel, light, inverse_depth, index, at, fa, fb, gain, bias,
-            shade,
+            first, last, width, rotation, eye, lens, table, textures.packed, textures.offsets, ground.packed,
+            ground.layout, ground.corner, ground.texel, light, inverse_depth, index, shade,
         )  # fmt: skip
-    shading.blur(shade, BLUR_SIDE, bias, intensity)
+    shading.blur(shade, BLUR_SIDE, buffers.row, intensity)
     if with_depth:
         raster.write_depth(inverse_depth, depth, FAR)
 

@@ -2,7 +2,7 @@
 
 Surface textures are mip-mapped, and each texel carries its 2x2 neighbourhood in one ``uint32``: a
 bilinear look-up is then a single memory gather, which is what keeps the shading loops in SIMD. Cut-out
-textures (leaves, mesh) hold one ``int32`` per texel: 0 is a hole, otherwise the grey level.
+textures (leaves, mesh) hold one byte per texel: 0 is a hole, otherwise the grey level.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Textures(NamedTuple):
     Attributes:
         packed: ``(sum of level sizes,)`` uint32, every level of every surface texture, see ``offsets``.
         offsets: ``(textures, LEVELS)`` int64 start of each level in ``packed``.
-        cutouts: ``(cut-outs, SIZE * SIZE)`` int32.
+        cutouts: ``(cut-outs * SIZE * SIZE + 3,)`` uint8, one after the other; ``lanes.gather`` reads words.
     """
 
     packed: NDArray[np.uint32]
     offsets: NDArray[np.int64]
-    cutouts: NDArray[np.int32]
+    cutouts: NDArray[np.uint8]
 
 
 def halve(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -155,5 +155,6 @@ def load() -> Textures:
     ]
     plain = np.full_like(leaf, UNIT)
     shades = [leaf] * 4 + [plain] * 2
-    cutouts = [np.where(m, s, 0).astype(np.int32).ravel() for m, s in zip(masks, shades, strict=True)]
-    return Textures(np.concatenate(packed), np.array(offsets, np.int64), np.stack(cutouts))
+    cutouts = [np.where(m, s, 0).astype(np.uint8).ravel() for m, s in zip(masks, shades, strict=True)]
+    spare = np.zeros(3, np.uint8)
+    return Textures(np.concatenate(packed), np.array(offsets, np.int64), np.concatenate([*cutouts, spare]))
