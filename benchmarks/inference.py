@@ -1,6 +1,7 @@
 """Time of the networks at batch 1 in every runtime, against the released module as its authors run it.
 
     python benchmarks/inference.py [--checkpoint sunet2enresconv_best_model.pth] [--markdown docs/runtimes.md]
+    python benchmarks/inference.py --results runs/inference.json --minutes 6  # and again, until it is whole
 
 Two networks in every runtime, and then whole extrapolators: the released one and ours, with the motion
 estimate, warp and features that ours needs, side by side in each runtime.
@@ -15,7 +16,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from agents.keyframe_cnn import FrameDetector
-from nl_env.config import SPLITS, DrivingConfig
+from nl_env.config import SPLITS, DrivingConfig, choice
 from nl_env.depth.extrapolators import WEIGHTS, PaperUNet, Warp
 from nl_env.depth.learned import MotionWarpRefine
 from nl_env.depth.learned_networks import load_learned
@@ -41,8 +41,8 @@ from nl_env.depth.runtime import NetworkRunner
 from nl_env.depth.unet import UNet, load_released
 from nl_env.history import SensorHistory
 from nl_env.representations import voxel_from_bins
-from nl_env.reproduction.document import check_document, update_document
-from nl_env.runs import THREAD_VARIABLES
+from nl_env.reproduction.document import check_document, machine, update_document
+from nl_env.runs import THREAD_VARIABLES, write_text
 from nl_env.streams import SyntheticStream
 from nl_env.training import seeded
 from nl_env.types import RESOLUTIONS, DepthExtrapolator, ExtrapolationInput
@@ -64,6 +64,16 @@ ROWS: dict[str, Row] = {
 }
 UNET, DETECTOR = "released U-Net", "keyframe CNN"
 EXTRAPOLATORS = ("released extrapolator", "our extrapolator")
+CONTESTS: dict[str, dict[str, tuple[str, Row]]] = {
+    **{name: {row: (name, ROWS[row]) for row in ROWS} for name in (UNET, DETECTOR)},
+    **{
+        f"extrapolators, {runtime}": {name: (name, ROWS[runtime]) for name in EXTRAPOLATORS}
+        for runtime in ("torch", "OpenVINO", "OpenVINO bf16")
+    },
+}
+"""Network or extrapolator and row of every contestant, by contest; the first one is the reference."""
+SETTINGS = ("weights", "threads", "rounds", "repetitions", "intervals")
+"""What has to be the same in runs whose results stand in one file."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +94,12 @@ class Args:
     """Simulated LiDAR intervals, four moments each, that are run in turn."""
     ours: Path = WEIGHTS / "unet.safetensors"
     """Weights of our extrapolator."""
+    contests: tuple[str, ...] = tuple(CONTESTS)
+    """Which of the contests."""
+    minutes: float = float("inf")
+    """No other measurement is begun after this long."""
+    results: Path | None = None
+    """JSON file that takes every measurement as soon as it is made; those it has are not made again."""
     markdown: Path | None = None
     """Document whose results are replaced."""
 
@@ -158,6 +174,7 @@ def extrapolator_calls(
             threshold=ours.threshold,
             warped=ours.warped,
             events=ours.events,
+            threads=args.threads,
         )
 
     def run(interval: Sequence[ExtrapolationInput]) -> list[NDArray[np.float32]]:
@@ -272,54 +289,92 @@ def _medians(turns: list[list[tuple[float, float]]]) -> tuple[NDArray[np.float64
 
 def table(results: Results) -> str:
     """Markdown: a row per network and runtime, a column per size."""
-    sizes = list(next(iter(results.values())))
+    sizes = [size for size in RESOLUTIONS if any(size in by_size for by_size in results.values())]
     shapes = ["x".join(map(str, RESOLUTIONS[size])) for size in sizes]
-    lines = [
-        "| what | runtime | " + " | ".join(shapes) + " | largest / rms difference |",
-        "|---|---|" + "--:|" * len(sizes) + "--:|",
-    ]
+    lines = ["| what | runtime | " + " | ".join(shapes) + " |", "|---|---|" + "--:|" * len(sizes)]
     for title, by_size in results.items():
-        for row in by_size[sizes[0]]:
-            found = [by_size[size][row] for size in sizes]
-            cells = [f"{one['median_ms']:.3g} ms ({one['speed_up']:.2g}x)" for one in found]
-            largest = max(one["largest_difference"] for one in found)
-            rms = max(one["rms_difference"] for one in found)
-            apart = "" if title.startswith("extrapolators") else f"{largest:.2g} / {rms:.2g}"
-            lines.append(f"| {title} | {row} | {' | '.join(cells)} | {apart} |")
+        for row in CONTESTS[title]:
+            cells = [
+                f"{by_size[size][row]['median_ms']:.3g} ms ({by_size[size][row]['speed_up']:.2g}x)"
+                if size in by_size
+                else "-"
+                for size in sizes
+            ]
+            lines.append(f"| {title} | {row} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def differences(results: Results) -> str:
+    """How far the runtimes' outputs are from eager's, in words; nothing without any."""
+    sentences = []
+    for title, unit in ((UNET, " m"), (DETECTOR, "")):
+        for row in CONTESTS[title]:
+            found = [by_row[row] for by_row in results.get(title, {}).values()]
+            if found and ROWS[row] != EAGER:
+                largest = max(one["largest_difference"] for one in found)
+                rms = max(one["rms_difference"] for one in found)
+                sentences.append(f"{title}, {row}: {largest:.2g}{unit} at most, {rms:.2g}{unit} RMS")
+    return f"Differences from eager, the worst of the sizes. {'; '.join(sentences)}." if sentences else ""
+
+
+def read_results(args: Args, settings: dict[str, object]) -> Results:
+    """What ``args.results`` holds already, if there is such a file.
+
+    Raises:
+        ValueError: it is no file of results, or they were measured with other settings.
+    """
+    if args.results is None or not args.results.is_file():
+        return {}
+    try:
+        report = json.loads(args.results.read_text(encoding="utf-8"))
+        found, results = {name: report[name] for name in SETTINGS}, report["results"]
+    except (ValueError, KeyError, TypeError) as cause:
+        raise ValueError(f"results: found no results in {str(args.results)!r} ({cause!r})") from cause
+    expected = {name: settings[name] for name in SETTINGS}
+    if found != expected:
+        raise ValueError(f"results: found {found} in {str(args.results)!r}, expected {expected}")
+    return {title: results[title] for title in CONTESTS if title in results}
 
 
 def main(args: Args) -> None:
     """Measure, print JSON, and write the document."""
+    for title in args.contests:
+        choice("contests", title, tuple(CONTESTS))
     if args.markdown is not None:
         check_document(args.markdown, "results")
-    contests = {name: {row: (name, ROWS[row]) for row in ROWS} for name in (UNET, DETECTOR)}
-    for runtime in ("torch", "OpenVINO", "OpenVINO bf16"):
-        contests[f"extrapolators, {runtime}"] = {name: (name, ROWS[runtime]) for name in EXTRAPOLATORS}
-    results: Results = {}
-    for title, contestants in contests.items():
-        results[title] = {}
-        for size in args.sizes:
-            results[title][size] = measure(contestants, size, args)
-            found = ", ".join(
-                f"{name} {one['median_ms']:.3g} ms ({one['speed_up']:.2g}x)"
-                for name, one in results[title][size].items()
-            )
-            print(f"{title}, {size}: {found}", file=sys.stderr)
-    weights = "random" if args.checkpoint is None else args.checkpoint.name
-    report = {
+    settings: dict[str, object] = {
+        "weights": "random" if args.checkpoint is None else args.checkpoint.name,
         "threads": args.threads,
-        "weights": weights,
-        "machine": platform.machine(),
-        "results": results,
+        "rounds": args.rounds,
+        "repetitions": args.repetitions,
+        "intervals": args.intervals,
+        "machine": machine(),
     }
-    print(json.dumps(report, indent=2))
+    results = read_results(args, settings)
+    wanted = [(title, size) for title in args.contests for size in args.sizes]
+    missing = [(title, size) for title, size in wanted if size not in results.get(title, {})]
+    start = time.monotonic()
+    while missing and time.monotonic() - start < args.minutes * 60:
+        title, size = missing.pop(0)
+        numbers = measure(CONTESTS[title], size, args)
+        results.setdefault(title, {})[size] = numbers
+        results = {name: results[name] for name in CONTESTS if name in results}
+        found = ", ".join(
+            f"{name} {one['median_ms']:.3g} ms ({one['speed_up']:.2g}x)" for name, one in numbers.items()
+        )
+        print(f"{title}, {size}: {found}", file=sys.stderr)
+        if args.results is not None:
+            write_text(args.results, json.dumps({**settings, "results": results}, indent=2) + "\n")
+    if missing:
+        print("not measured yet: " + "; ".join(map(", ".join, missing)), file=sys.stderr)
+    print(json.dumps({**settings, "results": results}, indent=2))
     if args.markdown is not None:
         note = (
-            f"{args.threads} threads, batch 1, U-Net weights: {weights}. Median ms per depth frame or "
-            "decision (times the first row of its kind)."
+            f"{settings['machine']}, {args.threads} threads, batch 1, U-Net weights: {settings['weights']}. "
+            "Median ms per depth frame or decision (times as fast as the first row of its kind)."
         )
-        update_document(args.markdown, "results", f"{note}\n\n{table(results)}")
+        text = f"{note}\n\n{table(results)}\n\n{differences(results)}"
+        update_document(args.markdown, "results", text)
 
 
 if __name__ == "__main__":

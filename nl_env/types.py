@@ -215,6 +215,15 @@ class DepthExtrapolator(Protocol):
     def __call__(self, inputs: ExtrapolationInput) -> Extrapolation: ...
 
 
+@runtime_checkable
+class BatchExtrapolator(DepthExtrapolator, Protocol):
+    """A :class:`DepthExtrapolator` that can make several frames of a sequence at once."""
+
+    def batch(self, inputs: Sequence[ExtrapolationInput]) -> list[Extrapolation]:
+        """What single calls give, up to rounding; all of it may be of one or of several LiDAR intervals."""
+        ...
+
+
 class TriggerPolicy(Protocol):
     """Decides at every slice whether to trigger; the signature is Stable-Baselines3's ``predict``."""
 

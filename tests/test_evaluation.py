@@ -89,6 +89,34 @@ def test_repeating_the_lidar_frame_is_never_younger():
     assert errors[9, :5] == pytest.approx(np.log(wall_depth(5) / wall_depth(9)), abs=1e-4)
 
 
+class Together(Approach):
+    """Makes several frames at once, and remembers how many."""
+
+    def __init__(self):
+        super().__init__()
+        self.counts = []
+
+    def batch(self, inputs):
+        self.counts.append(len(inputs))
+        return [super(Together, self).__call__(one) for one in inputs]
+
+    def __call__(self, inputs):
+        raise AssertionError("one at a time")
+
+
+def test_an_extrapolator_that_can_makes_the_frames_of_an_interval_together():
+    together = Together()
+    found = trace_sequence(WallStream(slices=23), together, 3, keep_frames=True)
+    assert together.counts == [4, 4, 4, 4, 3]
+    alone = trace_sequence(WallStream(slices=23), Approach(), 3, keep_frames=True)
+    for name, table in alone.errors.items():
+        np.testing.assert_array_equal(found.errors[name], table)
+    np.testing.assert_array_equal(found.frames.produced, alone.frames.produced)
+    rare = Together()
+    trace_sequence(WallStream(slices=20, lidar_period=10), rare, 3)
+    assert rare.counts == [4, 4, 1, 4, 4, 1]
+
+
 def test_columns_and_frames_of_a_trace(trace):
     assert trace.slices == 23
     assert np.flatnonzero(trace.lidar).tolist() == [0, 5, 10, 15, 20]

@@ -2,7 +2,7 @@
 
 import json
 import pickle
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from nl_env.depth.extrapolators import NETWORKS, WEIGHTS, make_extrapolator
 from nl_env.depth.learned import MotionWarpRefine
 from nl_env.depth.learned_networks import ARCHITECTURE, LearnedNetworks
 from nl_env.depth.unet import UNet, UNetOptions, unet_card
+from nl_env.types import BatchExtrapolator
 from nl_env.weight_files import Card, write_weights
 
 OURS = {"motion": {"channels": [4, 4, 4]}, "refine": {"channels": [4, 4]}, "threshold": 0.25}
@@ -59,6 +60,18 @@ def test_a_card_says_what_is_made_of_weights(weights, shown):
     assert np.abs(made.depth_if_return - prior).max() > 0.01  # the networks were asked
 
 
+def test_several_frames_at_once_are_those_of_single_calls(weights, shown):
+    earlier = replace(shown, t=shown.t - 20_000, bins=shown.bins[:-1])
+    extrapolator = make_extrapolator(weights)
+    assert isinstance(extrapolator, BatchExtrapolator)
+    together = extrapolator.batch([earlier, shown, earlier])
+    for one, found in zip([earlier, shown, earlier], together, strict=True):
+        alone = extrapolator(one)
+        np.testing.assert_allclose(found.depth_if_return, alone.depth_if_return, rtol=1e-5)
+        assert np.mean(found.depth == 0) == pytest.approx(np.mean(alone.depth == 0), abs=1e-3)
+    assert np.abs(together[0].depth_if_return - together[1].depth_if_return).max() > 1e-3
+
+
 def test_true_poses_replace_the_motion_network(tmp_path, shown):
     torch.manual_seed(0)
     path = tmp_path / "small.safetensors"
@@ -77,7 +90,9 @@ def test_an_exported_folder_answers_like_its_weights(weights, shown, tmp_path, c
     export_onnx.main(export_onnx.Args(str(weights), folder))
     assert "largest difference from PyTorch" in capsys.readouterr().out
     expected = make_extrapolator(weights, runtime="torch")(shown)
-    found = make_extrapolator(folder)(shown)
+    exported = make_extrapolator(folder)
+    found, again = exported.batch([shown, shown])
+    np.testing.assert_array_equal(found.depth, again.depth)
     np.testing.assert_allclose(found.depth_if_return, expected.depth_if_return, rtol=1e-3, atol=1e-3)
     with pytest.raises(FileExistsError, match="holds an export"):
         export_onnx.main(export_onnx.Args(str(weights), folder))

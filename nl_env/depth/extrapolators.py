@@ -6,7 +6,7 @@ Importing this module does not import PyTorch; only the networks do, when they a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from nl_env.depth.exported import load_parts, read_export
 from nl_env.depth.learned import MotionWarpRefine
 from nl_env.depth.metrics import returns_from_depth
 from nl_env.depth.motion import IntervalMotion, continued
-from nl_env.depth.runtime import RUNTIMES, NetworkRunner
+from nl_env.depth.runtime import RUNTIMES, CompiledNetwork, NetworkRunner
 from nl_env.depth.warp import warp
 from nl_env.representations import voxel_from_bins
 from nl_env.types import DepthExtrapolator, Extrapolation, ExtrapolationInput
@@ -120,7 +120,7 @@ class PaperUNet:
     as the network gave it is what the paper's metrics see.
 
     Args:
-        network: ``(1, 1, H, W)`` m and ``(1, 5, H, W)`` counts to ``(1, 1, H, W)`` m, in some runtime.
+        network: ``(n, 1, H, W)`` m and ``(n, 5, H, W)`` counts to ``(n, 1, H, W)`` m, in some runtime.
         min_return: m.
     """
 
@@ -137,12 +137,20 @@ class PaperUNet:
         """Nothing to forget."""
 
     def __call__(self, inputs: ExtrapolationInput) -> Extrapolation:
-        prior = inputs.lidar_frames[-1]
-        prior = np.where(prior < inputs.max_depth, prior, np.float32(0))
-        voxel = voxel_from_bins(inputs.bins)
-        (predicted,) = self._network(prior[None, None], voxel[None])
-        depth = predicted[0, 0]
-        return Extrapolation(returns_from_depth(depth, self._min_return), depth_if_return=depth)
+        return self.batch([inputs])[0]
+
+    def batch(self, inputs: Sequence[ExtrapolationInput]) -> list[Extrapolation]:
+        """As :class:`nl_env.types.BatchExtrapolator`: one run of the network for all of them."""
+        priors = [
+            np.where(one.lidar_frames[-1] < one.max_depth, one.lidar_frames[-1], np.float32(0))
+            for one in inputs
+        ]
+        voxels = [voxel_from_bins(one.bins) for one in inputs]
+        (predicted,) = self._network(np.stack(priors)[:, None], np.stack(voxels))
+        return [
+            Extrapolation(returns_from_depth(depth, self._min_return), depth_if_return=depth)
+            for depth in predicted[:, 0]
+        ]
 
 
 NETWORKS = {"unet": "our motion warp and U-Net", "unet-paper": "the paper's network"}
@@ -234,10 +242,21 @@ def _from_weights(path: Path, odometry: bool, runtime: str, precision: str | Non
 def _from_export(folder: Path, odometry: bool, runtime: str, precision: str | None) -> DepthExtrapolator:
     """What an exported folder holds, without PyTorch."""
     export = read_export(folder)
-    parts = load_parts(folder, export, runtime, precision)
+    loaded = load_parts(folder, export, runtime, precision)
+    parts = {name: _one_by_one(network) for name, network in loaded.items()}
     if "network" in parts:
         return PaperUNet(parts["network"])
     return MotionWarpRefine(parts.get("motion"), parts.get("refine"), odometry=odometry, **export.options)
+
+
+def _one_by_one(network: CompiledNetwork) -> Callable[..., tuple[NDArray[np.float32], ...]]:
+    """``network``, which takes one image at a time, for batches."""
+
+    def run(*inputs: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        outputs = [network(*(array[i : i + 1] for array in inputs)) for i in range(len(inputs[0]))]
+        return tuple(np.concatenate(parts) for parts in zip(*outputs, strict=True))
+
+    return run
 
 
 def _period_and_gap(inputs: ExtrapolationInput) -> tuple[float, float]:

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from nl_env.depth.threads import together
 from nl_env.depth.warp import z_buffer
 from nl_env.types import BINS, Camera
 
@@ -30,10 +31,12 @@ CHANNELS = (
 EVENTS = slice(CHANNELS.index("events 0"), CHANNELS.index("events 0") + BINS)
 """The channels of the voxel grid."""
 
-_FLOW = slice(CHANNELS.index("flow x"), CHANNELS.index("flow y") + 1)
-_DEPTHS = tuple(map(CHANNELS.index, ("warped log depth", "prior log depth", "previous against warped")))
+_WARPED, _PRIOR, _PREVIOUS = map(
+    CHANNELS.index, ("warped log depth", "prior log depth", "previous against warped")
+)
 """The channels that hold metres first, and then logarithms, which NumPy takes many at a time."""
 
+_FLOW = slice(CHANNELS.index("flow x"), CHANNELS.index("flow y") + 1)
 NEAREST = 1.0
 """Depths below are read as this one, m (as in the full-image metrics outdoors)."""
 
@@ -111,7 +114,14 @@ def _coarse_step(camera: Camera) -> int:
     return 2 ** max(round(math.log2(camera.width / COARSE_WIDTH)), 0)
 
 
-def features(scene: Scene, motion: NDArray[np.float64], *, compensated: bool = False) -> NDArray[np.float32]:
+def features(
+    scene: Scene,
+    motion: NDArray[np.float64],
+    *,
+    compensated: bool = False,
+    threads: int = 1,
+    out: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
     """The stack for the motion ``(4, 4)`` from the prior's camera to the present one.
 
     With ``compensated`` the events of every bin lie where the motion has carried their surface since the
@@ -120,11 +130,17 @@ def features(scene: Scene, motion: NDArray[np.float64], *, compensated: bool = F
 
     Holes of the warped frame show the prior's own value, as :func:`nl_env.depth.warp.warp` does.
 
+    Args:
+        scene, motion, compensated: see above.
+        threads: with two or more, what comes from the prior and what comes from the frame before and the
+            events are made at once; the result is the same.
+        out: where to put the stack, ``(len(CHANNELS), H, W)`` float32 of consecutive values.
+
     Returns:
         ``(len(CHANNELS), H, W)`` float32.
 
     Raises:
-        ValueError: a frame or the voxel grid does not have the camera's shape, a gap that is not
+        ValueError: a frame, the voxel grid or ``out`` does not have the camera's shape, a gap that is not
             positive, or a motion that is no finite 4x4 matrix.
     """
     shape = scene.camera.shape
@@ -132,28 +148,48 @@ def features(scene: Scene, motion: NDArray[np.float64], *, compensated: bool = F
         raise ValueError(f"voxel: found shape {scene.voxel.shape}, expected {(BINS, *shape)}")
     if not scene.gap > 0:
         raise ValueError(f"gap: found {scene.gap!r} s, expected a positive time")
+    expected = len(CHANNELS), *shape
+    stack = np.empty(expected, np.float32) if out is None else out
+    if stack.shape != expected or stack.dtype != np.float32 or not stack.flags.c_contiguous:
+        raise ValueError(f"out: found {stack.dtype} {stack.shape}, expected consecutive float32 {expected}")
+
+    def add_past() -> None:
+        _add_previous(scene, motion, stack)
+        if not compensated:
+            stack[EVENTS] = scene.voxel
+            _compress(stack[EVENTS])
+
+    together((lambda: _add_prior(scene, motion, stack), add_past), threads)
+    _compare(stack)
+    if compensated:
+        _carry_events(np.ascontiguousarray(scene.voxel, np.float32), stack[_FLOW], stack[EVENTS])
+        _compress(stack[EVENTS])
+    return stack
+
+
+def _add_prior(scene: Scene, motion: NDArray[np.float64], stack: NDArray[np.float32]) -> None:
+    """The channels of the prior, as it was and warped, and what its motion says."""
     warped = z_buffer(scene.prior, scene.camera, motion, scene.max_depth)
-    if scene.previous is None:
-        older = np.full(shape, np.float32(-1))
-    else:
-        older = z_buffer(scene.previous, scene.camera, motion @ scene.last_motion, scene.max_depth)
-    stack = np.empty((len(CHANNELS), *shape), np.float32)
     camera = scene.camera
-    _fill_depths(np.ascontiguousarray(scene.prior), warped, older, np.float32(scene.max_depth), stack)
-    for channel in _DEPTHS:
-        np.log(stack[channel], out=stack[channel])
+    _fill_prior(np.ascontiguousarray(scene.prior), warped, np.float32(scene.max_depth), stack)
+    np.log(stack[_WARPED], out=stack[_WARPED])
+    np.log(stack[_PRIOR], out=stack[_PRIOR])
     _fill_codes(stack)
     _fill_flow(
         np.array([camera.fx, camera.fy, camera.cx, camera.cy]), np.linalg.inv(motion), stack[3], stack[_FLOW]
     )
     np.arcsinh(stack[_FLOW], out=stack[_FLOW])
     stack[_FLOW.stop :] = math.log2(scene.gap / GAP_UNIT) / 2
-    if compensated:
-        _carry_events(np.ascontiguousarray(scene.voxel, np.float32), stack[_FLOW], stack[EVENTS])
+
+
+def _add_previous(scene: Scene, motion: NDArray[np.float64], stack: NDArray[np.float32]) -> None:
+    """The previous frame warped: its logarithms, and where it is hit."""
+    if scene.previous is None:
+        older = np.full(scene.camera.shape, np.float32(-1))
     else:
-        stack[EVENTS] = scene.voxel
-    _compress(stack[EVENTS])
-    return stack
+        older = z_buffer(scene.previous, scene.camera, motion @ scene.last_motion, scene.max_depth)
+    _fill_previous(older, np.float32(scene.max_depth), stack)
+    np.log(stack[_PREVIOUS], out=stack[_PREVIOUS])
 
 
 def hide_events(stack: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -165,9 +201,9 @@ def hide_events(stack: NDArray[np.float32]) -> NDArray[np.float32]:
 # The loops below go over few arrays each and have no branches: they run on vectors then.
 
 
-@njit(cache=True, error_model="numpy")
-def _fill_depths(prior, warped, older, max_depth, stack):  # type: ignore[no-untyped-def]
-    """Every channel of depths, metres instead of logarithms; ``warped`` and ``older`` are z-buffers."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fill_prior(prior, warped, max_depth, stack):  # type: ignore[no-untyped-def]
+    """Channels of the prior and of its z-buffer ``warped``, metres instead of logarithms."""
     height, width = prior.shape
     farthest = np.float32(1) / max_depth
     for y in range(height):
@@ -181,6 +217,14 @@ def _fill_depths(prior, warped, older, max_depth, stack):  # type: ignore[no-unt
         metres, has_return, inverse = stack[0, y], stack[1, y], stack[3, y]
         for x in range(width):
             inverse[x] = np.float32(1) / metres[x] if has_return[x] > 0 else np.float32(0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fill_previous(older, max_depth, stack):  # type: ignore[no-untyped-def]
+    """Channels of the z-buffer ``older`` of the previous frame, metres instead of logarithms."""
+    height, width = older.shape
+    farthest = np.float32(1) / max_depth
+    for y in range(height):
         found, depth, hit = older[y], stack[6, y], stack[7, y]
         for x in range(width):
             depth[x] = np.float32(1) / found[x] if found[x] > farthest else np.float32(0)
@@ -198,15 +242,23 @@ def _fill_metres(depth, max_depth, metres, has_return):  # type: ignore[no-untyp
         metres[x] = max(depth[x], np.float32(NEAREST)) if valid else max_depth
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fill_codes(stack):  # type: ignore[no-untyped-def]
-    """Logarithms of depths to codes; that of the previous frame to what it differs by where it is hit."""
+    """Logarithms of the prior's depths to codes."""
     for y in range(stack.shape[1]):
-        warped, prior, older, hit = stack[0, y], stack[4, y], stack[6, y], stack[7, y]
+        warped, prior = stack[0, y], stack[4, y]
         for x in range(warped.size):
             prior[x] = _code(prior[x])
         for x in range(warped.size):
             warped[x] = _code(warped[x])
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _compare(stack):  # type: ignore[no-untyped-def]
+    """Logarithms of the previous frame's depths to what they differ by from the prior's where it is hit."""
+    for y in range(stack.shape[1]):
+        warped, older, hit = stack[0, y], stack[6, y], stack[7, y]
+        for x in range(warped.size):
             older[x] = _code(older[x]) - warped[x] if hit[x] > 0 else np.float32(0)
 
 
@@ -215,7 +267,7 @@ def _code(logarithm):  # type: ignore[no-untyped-def]
     return (logarithm - np.float32(LOG_CENTRE)) * np.float32(1 / LOG_SCALE)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _fill_flow(intrinsics, back, inverse, flow):  # type: ignore[no-untyped-def]
     """Where every pixel was in the prior: how far its surface moved, in pixels; then scale ``inverse``.
 

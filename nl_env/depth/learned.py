@@ -6,22 +6,23 @@ whatever runtime executes them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.depth.features import Scene, features, hide_events
+from nl_env.depth.features import CHANNELS, Scene, features, hide_events
 from nl_env.depth.motion import IntervalMotion, continued
 from nl_env.depth.refine_answer import depth_frames
+from nl_env.depth.threads import usable_threads
 from nl_env.depth.twist import corrected
 from nl_env.depth.warp import warp
 from nl_env.representations import voxel_from_bins
 from nl_env.types import Extrapolation, ExtrapolationInput
 
 Network = Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], ...]]
-"""A network in some runtime: a batch of one in, a batch of one out."""
+"""A network in some runtime: a batch in, a batch out."""
 
 MULTIPLE = 8
 """Image sides must be multiples of this."""
@@ -36,11 +37,13 @@ class MotionWarpRefine:
 
     Args:
         motion: the motion network, ``(1, C, H, W)`` features to ``(1, 2, H/4, W/4)``.
-        refine: the refinement network, ``(1, C, H, W)`` features to ``(1, 3, H, W)``.
+        refine: the refinement network, ``(n, C, H, W)`` features to ``(n, 3, H, W)``.
         threshold: logit from which there is a return.
         warped: False for a refinement that was trained on frames that are not warped.
         events: False for networks that were trained without events.
         odometry: take the true poses instead of estimating the motion.
+        threads: of what surrounds the networks, at most; the default is that of a network. The frames do
+            not depend on it.
     """
 
     history = 2
@@ -54,8 +57,10 @@ class MotionWarpRefine:
         warped: bool = True,
         events: bool = True,
         odometry: bool = False,
+        threads: int | None = None,
     ) -> None:
         self.odometry = odometry
+        self._threads = threads
         self._motion, self._refine = motion, refine
         self._threshold, self._warped, self._events = threshold, warped, events
         self._interval = IntervalMotion()
@@ -65,16 +70,31 @@ class MotionWarpRefine:
         self._interval = IntervalMotion()
 
     def __call__(self, inputs: ExtrapolationInput) -> Extrapolation:
+        return self.batch([inputs])[0]
+
+    def batch(self, inputs: Sequence[ExtrapolationInput]) -> list[Extrapolation]:
+        """As :class:`nl_env.types.BatchExtrapolator`: one run of the refinement for all of them."""
+        posed = [self._scene_and_corrected_motion(one) for one in inputs]
+        if self._refine is None:
+            return [Extrapolation(warp(s.prior, s.camera, motion, s.max_depth)) for s, motion in posed]
+        if not self._warped:
+            posed = [(replace(scene, last_motion=np.eye(4)), np.eye(4)) for scene, _ in posed]
+        shape = inputs[0].camera.shape
+        seen = np.empty((len(posed), len(CHANNELS), *shape), np.float32)
+        for (scene, motion), stack in zip(posed, seen, strict=True):
+            self._see(scene, motion, stack)
+        (answers,) = self._refine(seen)
+        threads = usable_threads(shape, self._threads)
+        return [
+            Extrapolation(*depth_frames(answer, one.max_depth, self._threshold, threads))
+            for answer, one in zip(answers, inputs, strict=True)
+        ]
+
+    def _scene_and_corrected_motion(self, inputs: ExtrapolationInput) -> tuple[Scene, NDArray[np.float64]]:
         scene, motion = self._scene_and_motion(inputs)
         if self._motion is not None and self._warped and not self.odometry:
             motion = self._corrected(scene, motion)
-        if self._refine is None:
-            return Extrapolation(warp(scene.prior, scene.camera, motion, scene.max_depth))
-        if not self._warped:
-            scene, motion = replace(scene, last_motion=np.eye(4)), np.eye(4)
-        (answer,) = self._refine(self._seen(scene, motion)[None])
-        depth, depth_if_return = depth_frames(answer[0], scene.max_depth, self._threshold)
-        return Extrapolation(depth, depth_if_return)
+        return scene, motion
 
     def _scene_and_motion(self, inputs: ExtrapolationInput) -> tuple[Scene, NDArray[np.float64]]:
         """What is known, and the motion over the gap before any correction."""
@@ -103,12 +123,20 @@ class MotionWarpRefine:
         """``motion`` as the events correct it; seen at about a quarter of the full resolution."""
         assert self._motion is not None
         coarse = scene.coarse()
-        stack = self._seen(coarse, motion, compensated=True)
+        stack = np.empty((len(CHANNELS), *coarse.camera.shape), np.float32)
+        self._see(coarse, motion, stack, compensated=True)
         (answer,) = self._motion(stack[None])
         return corrected(motion, answer[0], stack, coarse.camera, coarse.gap)
 
-    def _seen(
-        self, scene: Scene, motion: NDArray[np.float64], compensated: bool = False
-    ) -> NDArray[np.float32]:
-        stack = features(scene, motion, compensated=compensated)
-        return stack if self._events else hide_events(stack)
+    def _see(
+        self,
+        scene: Scene,
+        motion: NDArray[np.float64],
+        stack: NDArray[np.float32],
+        compensated: bool = False,
+    ) -> None:
+        """Fill ``stack`` with the features."""
+        threads = usable_threads(scene.camera.shape, self._threads)
+        features(scene, motion, compensated=compensated, threads=threads, out=stack)
+        if not self._events:
+            hide_events(stack)

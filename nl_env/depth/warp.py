@@ -169,7 +169,7 @@ def _land(above, row, below, rays, count, ray_y, size, intrinsics, motion, way, 
         pieces[k + 6 * _CHUNK] = np.floor(max(min(v + reach_v, last_y), -1.0)) if seen else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _splat(depth, max_depth, intrinsics, motion):  # type: ignore[no-untyped-def]
     """Z-buffer of inverse depth after the motion: 0 where only sky landed, -1 where nothing did."""
     height, width = depth.shape

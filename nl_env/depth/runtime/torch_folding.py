@@ -7,11 +7,17 @@ that with strides, and somebody else has to do the other; here both happen in on
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+
 import numpy as np
 import torch
 from numba import njit
 from torch import Tensor, fx
 from torch.nn import functional
+
+from nl_env.depth.threads import together, usable_threads
 
 _BLOCK = 16
 """Folded pixels that are filled together: few enough for the fastest cache, enough to read whole lines."""
@@ -21,8 +27,8 @@ def folded(image: Tensor, factor: int) -> Tensor:
     """``pixel_unshuffle`` of a dense float32 image ``(N, C, H, W)``, channels last."""
     count, channels, height, width = image.shape
     size = count, height // factor, width // factor, channels * factor**2
-    out = np.empty(size, np.float32)
-    _fold(image.contiguous().numpy(), factor, out)
+    dense, out = image.contiguous().numpy(), np.empty(size, np.float32)
+    _in_bands(lambda first, last: _fold(dense, factor, first, last, out), size[1:3])
     return torch.from_numpy(out).permute(0, 3, 1, 2)
 
 
@@ -30,8 +36,16 @@ def unfolded(image: Tensor, factor: int) -> Tensor:
     """``pixel_shuffle`` of a float32 image ``(N, C, H, W)`` with channels last, dense."""
     count, channels, height, width = image.shape
     out = np.empty((count, channels // factor**2, height * factor, width * factor), np.float32)
-    _unfold(image.permute(0, 2, 3, 1).contiguous().numpy(), factor, out)
+    places = image.permute(0, 2, 3, 1).contiguous().numpy()
+    _in_bands(lambda first, last: _unfold(places, factor, first, last, out), (height, width))
     return torch.from_numpy(out)
+
+
+def _in_bands(work: Callable[[int, int], None], shape: tuple[int, int]) -> None:
+    """``work`` on all rows, from a first one to before a last one, in as many threads as PyTorch has."""
+    threads = usable_threads(shape, torch.get_num_threads())
+    edges = [k * shape[0] // threads for k in range(threads + 1)]
+    together([partial(work, first, last) for first, last in pairwise(edges)], threads)
 
 
 def replace_foldings(module: fx.GraphModule) -> None:
@@ -49,12 +63,12 @@ def replace_foldings(module: fx.GraphModule) -> None:
     module.recompile()
 
 
-@njit(cache=True, error_model="numpy")
-def _fold(image, factor, out):  # type: ignore[no-untyped-def]
-    """``(N, C, H, W)`` to ``(N, H/f, W/f, C f f)``."""
-    _, channels, height, _ = image.shape
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fold(image, factor, first_row, last_row, out):  # type: ignore[no-untyped-def]
+    """``(N, C, H, W)`` to some rows of ``(N, H/f, W/f, C f f)``."""
+    channels = image.shape[1]
     for n in range(image.shape[0]):
-        for y in range(height // factor):
+        for y in range(first_row, last_row):
             for first in range(0, out.shape[2], _BLOCK):
                 target = out[n, y, first : first + _BLOCK]
                 for c in range(channels):
@@ -64,12 +78,12 @@ def _fold(image, factor, out):  # type: ignore[no-untyped-def]
                             target[x, c * factor**2 + k] = source[x * factor]
 
 
-@njit(cache=True, error_model="numpy")
-def _unfold(image, factor, out):  # type: ignore[no-untyped-def]
-    """``(N, H, W, C f f)`` to ``(N, C, f H, f W)``."""
-    _, channels, height, _ = out.shape
+@njit(cache=True, error_model="numpy", nogil=True)
+def _unfold(image, factor, first_row, last_row, out):  # type: ignore[no-untyped-def]
+    """Some rows of ``(N, H, W, C f f)`` to ``(N, C, f H, f W)``."""
+    channels = out.shape[1]
     for n in range(out.shape[0]):
-        for y in range(height // factor):
+        for y in range(first_row, last_row):
             for first in range(0, image.shape[2], _BLOCK):
                 source = image[n, y, first : first + _BLOCK]
                 for c in range(channels):
