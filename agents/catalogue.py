@@ -108,7 +108,7 @@ def _trigger_value(weights: Path, parameter: float | None) -> Policy:
     return TriggerValue.load(weights, parameter)
 
 
-def _reinforced(weights: Path, trigger_cost: float | None) -> Policy:
+def _trigger_network(weights: Path, trigger_cost: float | None) -> Policy:
     from agents.rl import load_trigger
 
     return load_trigger(weights, trigger_cost)
@@ -130,6 +130,16 @@ def _values(weights: str) -> Family:
         weights=weights,
         parameter="cost of a trigger, in units of reward",
         default=0.1,
+        sweep=_COSTS,
+    )
+
+
+def _triggers(weights: str) -> Family:
+    return Family(
+        load=_trigger_network,
+        weights=weights,
+        parameter="cost of a trigger, in units of reward",
+        default=None,
         sweep=_COSTS,
     )
 
@@ -204,13 +214,9 @@ FAMILIES: dict[str, Family] = {
     "value-advantage": _values("value-advantage.safetensors"),
     "value-clone": _values("value-clone.safetensors"),
     "value-planned": _values("value-planned.safetensors"),
-    "rl": Family(
-        load=_reinforced,
-        weights="rl.safetensors",
-        parameter="cost of a trigger, in units of reward",
-        default=None,
-        sweep=_COSTS,
-    ),
+    "value-pictures": _triggers("value-pictures.safetensors"),
+    "rl": _triggers("rl.safetensors"),
+    "rl-pictures": _triggers("rl-pictures.safetensors"),
     "keyframe-rule": Family(lambda _, seed: KeyframeRule()),
     "greedy": Family(
         lambda threshold, seed: GreedyDepthChange(threshold),

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 import nl_env
 from agents.activity import StatisticsPolicy
 from agents.base import Actions, Memory, Policy
+from agents.pictures import PictureMemory, memory_size, picture, picture_shape
 from nl_env.config import number
+from nl_env.observations import IMAGE_OFFSET, STATE_FIELDS
 from nl_env.weight_files import Card, load_network
 
 WEIGHTS = Path(nl_env.__file__).parent / "weights" / "rl.safetensors"
@@ -144,15 +146,27 @@ class PictureTrigger(Policy):
         parts += [np.asarray(observation[key], np.float32).reshape(len(frames), -1) for key in self._keys]
         return np.concatenate(parts, axis=1), batched
 
+    def initial_memory(self, count: int) -> Memory:
+        """In mode ``"dict"`` the events since the held depth frame was made, by blocks of pixels."""
+        size = memory_size(picture_shape(*self.network.encoder.image.shape)) if self._keys else 0
+        return np.zeros((count, size), np.float32)
+
     def decide(self, seen: NDArray[np.float32], memory: Memory) -> Actions:
         import torch
 
         height, width = self.network.encoder.image.shape
         pixels = height * width
+        # ``read`` made them of integers.
+        shown = picture((seen[:, :pixels] + IMAGE_OFFSET).astype(np.uint8).reshape(-1, height, width))
+        vector = seen[:, pixels:]
+        if self._keys:
+            remembered = PictureMemory(memory, shown.shape[2:])
+            shown = remembered.see(shown, vector[:, STATE_FIELDS.index("since_depth")])
         with torch.inference_mode():
-            frames = torch.from_numpy(seen[:, :pixels]).reshape(-1, 1, height, width)
-            vector = torch.from_numpy(seen[:, pixels:]) if self._keys else None
-            margins = self.network(self.network.encode(frames), vector)
+            margins = self.network(
+                self.network.encode(torch.from_numpy(shown)),
+                torch.from_numpy(vector) if self._keys else None,
+            )
         return (margins > 0).numpy().astype(np.int64)
 
 

@@ -8,17 +8,16 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from agents.pictures import POOL, picture_shape
 from nl_env.config import choice
-from nl_env.observations import IMAGE_OFFSET, STATE_FIELDS
-from nl_env.statistics import ACTIVITY_FIELDS
+from nl_env.observations import STATE_FIELDS
+from nl_env.statistics import ACTIVITY_FIELDS, TYPICAL
 
 MODES = ("statistics", "dict", "image")
 """Observation modes that a network can be made for."""
 ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
-POOL = 4
-"""Event frames are averaged over blocks of this size before the first convolution."""
-MOST_EVENTS = 8.0
-"""Event sums are clipped to this magnitude: what lies above tells little more."""
+TYPICAL_BLOCK = float(TYPICAL) * POOL**2
+"""The number in a picture that the encoder maps to 1/2."""
 
 
 def vector_fields(obs_mode: str, conditioned: bool) -> int:
@@ -28,28 +27,20 @@ def vector_fields(obs_mode: str, conditioned: bool) -> int:
     return len(STATE_FIELDS) + (ACTIVITY_FIELDS if obs_mode == "statistics" else 0) + conditioned
 
 
-def event_sums(images: Tensor) -> Tensor:
-    """Image observations of any dtype as signed event sums, float32."""
-    return images.float() - IMAGE_OFFSET
-
-
 class ImageEncoder(nn.Module):
-    """Event frames to a few numbers: pooled sums and magnitudes through three strided convolutions.
+    """Pictures of event frames (:mod:`agents.pictures`) to a few numbers, through three strided convolutions.
 
     Args:
         height, width: of the event frames.
+        channels: of the pictures.
         size: numbers that come out.
     """
 
-    def __init__(self, height: int, width: int, size: int = 32) -> None:
+    def __init__(self, height: int, width: int, channels: int, size: int = 32) -> None:
         super().__init__()
-        if min(height, width) < 8 * POOL:
-            raise ValueError(
-                f"image: found event frames of {height}x{width}, expected at least {8 * POOL} pixels"
-            )
         self.shape = (height, width)
         self.layers = nn.Sequential(
-            nn.Conv2d(2, 8, 3, stride=2, padding=1),
+            nn.Conv2d(channels, 8, 3, stride=2, padding=1),
             nn.ReLU(),
             nn.Conv2d(8, 16, 3, stride=2, padding=1),
             nn.ReLU(),
@@ -58,14 +49,13 @@ class ImageEncoder(nn.Module):
             nn.Flatten(),
         )
         with torch.no_grad():
-            flat = self.layers(torch.zeros(1, 2, height // POOL, width // POOL)).shape[1]
+            flat = self.layers(torch.zeros(1, channels, *picture_shape(height, width))).shape[1]
         self.last = nn.Linear(flat, size)
 
-    def forward(self, sums: Tensor) -> Tensor:
-        """``(n, 1, H, W)`` float32 signed event sums to ``(n, size)``."""
-        sums = sums.clamp(-MOST_EVENTS, MOST_EVENTS) / MOST_EVENTS
-        pooled = nn.functional.avg_pool2d(torch.cat([sums, sums.abs()], dim=1), POOL)
-        return torch.relu(self.last(self.layers(pooled)))
+    def forward(self, pictures: Tensor) -> Tensor:
+        """``(n, channels, H / POOL, W / POOL)`` of any dtype to ``(n, size)``."""
+        sums = pictures.float()
+        return torch.relu(self.last(self.layers(sums / (sums.abs() + TYPICAL_BLOCK))))
 
 
 class Encoder(nn.Module):
@@ -81,7 +71,8 @@ class Encoder(nn.Module):
         super().__init__()
         choice("obs_mode", obs_mode, MODES)
         fields = vector_fields(obs_mode, conditioned)
-        self.image = None if obs_mode == "statistics" else ImageEncoder(height, width)
+        channels = {"dict": 3, "image": 2}
+        self.image = ImageEncoder(height, width, channels[obs_mode]) if obs_mode in channels else None
         self.mean: Tensor
         self.scale: Tensor
         self.register_buffer("mean", torch.zeros(fields))
@@ -149,11 +140,11 @@ class TriggerNetwork(nn.Module):
         self.last = nn.Linear(widths[-1], 1)
         self._activate = ACTIVATIONS[activation]()
 
-    def encode(self, sums: Tensor) -> Tensor:
-        """Encoded event sums, which depend on nothing else; ``ValueError`` where the mode has none."""
+    def encode(self, pictures: Tensor) -> Tensor:
+        """Encoded pictures, with a memory in mode ``"dict"``; ``ValueError`` where the mode has none."""
         if self.encoder.image is None:
             raise ValueError(f"encode: obs_mode {self.obs_mode!r} shows no image")
-        return self.encoder.image(sums)
+        return self.encoder.image(pictures)
 
     def forward(self, encoded: Tensor | None, vector: Tensor | None) -> Tensor:
         """``(n,)`` margins of encoded images and vectors, as :class:`Encoder` takes them."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from agents.pictures import MOST, PictureMemory, memory_size, picture, picture_shape
 from nl_env.batched_replay import BatchedReplayEnv
 from nl_env.observations import STATE_FIELDS, cost_coordinate
 from nl_env.statistics import ACTIVITY_FIELDS, GRID
@@ -20,22 +21,27 @@ from nl_env.types import SLICE_US
 class ReplayVecEnv(VecEnv):
     """A :class:`nl_env.batched_replay.BatchedReplayEnv` in Stable-Baselines3's terms.
 
-    Two changes make learning easier and leave the best policy as it is:
+    Three changes make learning easier and leave the best policy as it is:
 
     * Nothing that is done before a LiDAR frame matters after it. With ``end_at_lidar`` an episode ends there,
       so that returns are sums of at most one LiDAR interval and need no discount; the sequence goes on. Where
       costs are drawn from a range, each of these episodes draws its own.
     * With ``cost_offset`` rewards are divided by the trigger cost plus this, so that costs of 0.01 and of 1
       weigh alike in one batch. Within an episode that is a constant.
+    * With ``relative`` rewards count from what a frame of every slice would earn, triggers left out. No
+      decision changes that sum, which otherwise drowns what decisions do: some scenes are hard for all.
 
     Args:
         env: with autoreset ``SAME_STEP``; owned and closed by this one.
         end_at_lidar: see above.
         cost_offset: see above; None leaves rewards as they are.
+        relative: see above.
         mirror: show every second environment's events mirrored left to right.
+        pictures: show event frames as pictures (:mod:`agents.pictures`), in mode ``"dict"`` with a memory.
 
     Raises:
-        ValueError: another autoreset mode, or a cost offset that is not positive.
+        ValueError: another autoreset mode, a cost offset that is not positive, or pictures in a mode that has
+            none.
     """
 
     def __init__(
@@ -44,7 +50,9 @@ class ReplayVecEnv(VecEnv):
         *,
         end_at_lidar: bool = False,
         cost_offset: float | None = None,
+        relative: bool = False,
         mirror: bool = False,
+        pictures: bool = False,
     ) -> None:
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
@@ -52,9 +60,14 @@ class ReplayVecEnv(VecEnv):
         if cost_offset is not None and not cost_offset > 0:
             raise ValueError(f"cost_offset: found {cost_offset!r}, expected a positive number or None")
         self.env = env
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        space = env.single_observation_space
+        self._pictures = _Pictures(space, env.num_envs) if pictures else None
+        if self._pictures is not None:
+            space = self._pictures.space
+        super().__init__(env.num_envs, space, env.single_action_space)
         self._end_at_lidar = end_at_lidar
         self._cost_offset = cost_offset
+        self._relative = relative
         self._drawn = end_at_lidar and _shows_cost(env)
         self._mirrored = np.arange(env.num_envs) % 2 == 1 if mirror else np.zeros(env.num_envs, np.bool_)
         self._returns = np.zeros(env.num_envs)
@@ -70,7 +83,7 @@ class ReplayVecEnv(VecEnv):
         self._lengths[:] = 0
         self._steps = self._frames = 0
         self._costs = self.env.trigger_costs
-        return self._shown(observations)
+        return self._shown(observations, np.ones(self.num_envs, np.bool_))
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
         """Keep the actions for :meth:`step_wait`."""
@@ -78,6 +91,7 @@ class ReplayVecEnv(VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Act everywhere. Where an episode ended, the observation is the next one's first."""
+        fresh = self.env.fresh_rewards if self._relative else 0.0
         observations, rewards, _, truncated, found = self.env.step(self._actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         # Where a sequence ended these columns are of the next one's start; what ended is in "final_info".
@@ -94,13 +108,14 @@ class ReplayVecEnv(VecEnv):
             self._lengths[ended] = 0
         self._steps += self.num_envs
         self._frames += int(np.count_nonzero(lidar | triggered))
-        shown = self._shown(observations)
+        finals = {i: self._shown_last(found["final_obs"][i], i) for i in ended.tolist()}
+        shown = self._shown(observations, truncated)
         over = lidar if self._end_at_lidar else np.zeros_like(truncated)
         scale = None if self._cost_offset is None else self._costs + self._cost_offset
         for i in np.flatnonzero(truncated | over).tolist():
-            last = self._shown_one(found["final_obs"][i], i) if truncated[i] else _row(shown, i)
-            infos[i]["terminal_observation"] = last
+            infos[i]["terminal_observation"] = finals[i] if truncated[i] else _row(shown, i)
             infos[i]["TimeLimit.truncated"] = bool(truncated[i] and not over[i])
+        rewards = rewards - fresh  # returns are told as they are
         if scale is not None:
             rewards = rewards / scale
         if self._drawn and over.any():
@@ -159,21 +174,69 @@ class ReplayVecEnv(VecEnv):
         if indices is not None and len(set(self._get_indices(indices))) != self.num_envs:
             raise ValueError(f"indices: found {indices!r}, expected None: all environments are one object")
 
-    def _shown(self, observations: Any) -> Any:
-        """Observations, mirrored where they are to be; may write into the given arrays, which are fresh."""
-        if not self._mirrored.any():
-            return observations
-        if isinstance(observations, dict):
-            return observations | {"event_frame": self._shown(observations["event_frame"])}
-        observations[self._mirrored] = mirrored(observations[self._mirrored])
-        return observations
+    def _shown(self, observations: Any, started: NDArray[np.bool_]) -> Any:
+        """Observations, mirrored and as pictures where they are to be.
 
-    def _shown_one(self, observation: Any, place: int) -> Any:
+        May write into the given arrays, which are fresh. A sequence starts in environments of ``started``.
+        """
+        if self._mirrored.any():
+            if isinstance(observations, dict):
+                frames = observations["event_frame"]
+                frames[self._mirrored] = mirrored(frames[self._mirrored])
+            else:
+                observations[self._mirrored] = mirrored(observations[self._mirrored])
+        return observations if self._pictures is None else self._pictures.see(observations, started)
+
+    def _shown_last(self, observation: Any, place: int) -> Any:
+        """A sequence's last observation, of the slice that was seen last, as that was shown."""
+        if self._pictures is not None:
+            return self._pictures.again(observation, place)
         if not self._mirrored[place]:
             return observation
         if isinstance(observation, dict):
             return observation | {"event_frame": mirrored(observation["event_frame"])}
         return mirrored(observation)
+
+
+class _Pictures:
+    """Observations of modes ``"image"`` and ``"dict"`` with pictures in place of event frames.
+
+    Args:
+        space: of one environment.
+        count: of environments.
+
+    Attributes:
+        space: with pictures.
+    """
+
+    def __init__(self, space: spaces.Space[Any], count: int) -> None:
+        dictionary = isinstance(space, spaces.Dict)
+        frames = space["event_frame"] if isinstance(space, spaces.Dict) else space
+        if frames.dtype != np.uint8 or frames.shape is None:
+            raise ValueError(f"pictures: found observations {space}, expected obs_mode 'image' or 'dict'")
+        shape = picture_shape(*frames.shape[1:])
+        boxes = spaces.Box(-MOST, MOST, (3 if dictionary else 2, *shape), np.int8)
+        self.space = (
+            spaces.Dict({**space.spaces, "event_frame": boxes}) if isinstance(space, spaces.Dict) else boxes
+        )
+        self._memory = np.zeros((count, memory_size(shape)), np.float32)
+        self._shape = shape
+
+    def see(self, observations: Any, started: NDArray[np.bool_]) -> Any:
+        """The next observations of all environments; fresh."""
+        if not isinstance(observations, dict):
+            self._shown = picture(observations[:, 0])
+            return self._shown.copy()
+        self._memory[started] = 0.0
+        since_depth = observations["state"][:, STATE_FIELDS.index("since_depth")]
+        shown = picture(observations["event_frame"][:, 0])
+        self._shown = PictureMemory(self._memory, self._shape).see(shown, since_depth)
+        return observations | {"event_frame": self._shown.copy()}
+
+    def again(self, observation: Any, place: int) -> Any:
+        """One environment's observation of the slice that :meth:`see` took in last."""
+        shown = self._shown[place].copy()
+        return observation | {"event_frame": shown} if isinstance(observation, dict) else shown
 
 
 def _shows_cost(env: BatchedReplayEnv) -> bool:

@@ -134,14 +134,14 @@ def train(
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
     )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: _rate(step, options.steps))
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: share_of_rate(step, options.steps))
     floor = oracle_curve(validation)
     best: Evaluation | None = None
     weights = network.state_dict()
     history, losses = [], []
     for step in range(1, options.steps + 1):
         chosen = torch.randint(len(errors), (options.batch,), generator=rng)
-        costs = _draw_costs(options, rng)
+        costs = draw_costs(options, rng)
         loss = _loss(network, observations[chosen], errors[chosen], costs, options, rng)
         optimiser.zero_grad()
         loss.backward()
@@ -287,7 +287,8 @@ def _with_mirror(data: Decisions) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(observations), torch.from_numpy(np.nan_to_num(errors)).float()
 
 
-def _draw_costs(options: ValueTraining, rng: torch.Generator) -> Tensor:
+def draw_costs(options: ValueTraining, rng: torch.Generator) -> Tensor:
+    """A trigger cost for every interval of a batch."""
     low, high = math.log(options.cost_low), math.log(options.cost_high)
     return torch.exp(low + (high - low) * torch.rand(options.batch, generator=rng))
 
@@ -320,6 +321,18 @@ def _loss(
     output = network(seen)
     if options.objective == "reduction":
         return torch.nn.functional.smooth_l1_loss(output, _diagonal(errors) / network.unit)
+    return objective_loss(output, errors, costs, options)
+
+
+def objective_loss(output: Tensor, errors: Tensor, costs: Tensor, options: ValueTraining) -> Tensor:
+    """Mean loss of a network that is told the trigger cost and triggers where its output is above 0.
+
+    Args:
+        output: ``(n, states)``.
+        errors: ``(n, P, P)``, as :class:`agents.decisions.Decisions` has them.
+        costs: ``(n,)``.
+        options: with the objective; ``reduction`` is here what a trigger saves at its slice, less its price.
+    """
     price = costs * options.error_scale
     if options.objective == "planned":
         probabilities = torch.sigmoid(output)
@@ -328,7 +341,7 @@ def _loss(
         total = hold[:, 0] + probabilities[:, 0] * (trigger[:, 0] - hold[:, 0])
         return (total / (price + PRICE_OFFSET)).mean()
     hold, trigger = plan(errors, price)
-    gain = hold - trigger
+    gain = _diagonal(errors) - price[:, None] if options.objective == "reduction" else hold - trigger
     if options.objective == "clone":
         return torch.nn.functional.binary_cross_entropy_with_logits(output, (gain > 0).float())
     return torch.nn.functional.smooth_l1_loss(output, gain / (price + PRICE_OFFSET)[:, None])
@@ -338,7 +351,7 @@ PRICE_OFFSET = 2e-3
 """Totals are divided by the price plus this error, about what a trigger saves in slow traffic."""
 
 
-def _rate(step: int, steps: int) -> float:
-    """Share of the peak learning rate."""
+def share_of_rate(step: int, steps: int) -> float:
+    """Share of the peak learning rate at ``step`` (from 0 on) of ``steps``."""
     warm = max(1, steps // 10)
     return min((step + 1) / warm, 0.5 * (1 + math.cos(math.pi * step / steps)))

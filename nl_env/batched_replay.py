@@ -241,6 +241,12 @@ class BatchedReplayEnv(VectorEnv[Any, Any, Any]):
         return self._costs.copy()
 
     @property
+    def fresh_rewards(self) -> NDArray[np.float64]:
+        """``(n,)`` reward that a depth frame made at the slice acted on next earns, its trigger left out."""
+        errors = self._stack.errors[:, self._rows, self._pending, 0]
+        return self._reward_parts(errors, np.zeros(self.num_envs, np.bool_))[0]
+
+    @property
     def sequences(self) -> NDArray[np.int64]:
         """``(n,)`` int64, the sequence that each environment replays."""
         return np.array(self._sequences)[self._rows]

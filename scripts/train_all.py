@@ -1,20 +1,17 @@
-"""Remake the shipped weights from nothing: record, train every seed, measure the tables, ship.
+"""Remake the shipped weights from nothing: record, train every seed, measure, ship, trigger policies last.
 
-Every step is one command of this repository. Finished steps are not repeated, and an interrupted one goes on
-where it was, so starting this command again continues it.
+Extrapolators and detectors come first. All drives are then stored as traces with the shipped extrapolator,
+and on those the trigger policies are trained, compared and shipped. Every step is one command of this
+repository. Finished steps are not repeated, and an interrupted one goes on where it was, so starting this
+command again continues it.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shlex
-import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +20,30 @@ sys.path.insert(0, str(ROOT))  # runs from a checkout, wherever the command is s
 
 import tyro
 
+from agents.catalogue import parse_policy
 from nl_env.command_line import run_command
 from nl_env.config import choice, number
 from nl_env.depth.extrapolators import WEIGHTS
-from nl_env.runs import THREAD_VARIABLES, write_text
-from nl_env.weight_files import Card, card_path, read_card, read_tensors, write_weights
+from nl_env.steps import Runner, Step
+from nl_env.trace_files import default_folder
+from scripts import ship as shipping
+from scripts.frontier import ROWS
+from scripts.ship import POLICIES, Trained, ship_policies, ship_weights
 
-STAGES = ("record", "pairs", "train", "ablations", "tables", "ship")
-"""In order. The steps of "train" and "ablations" do not depend on each other."""
+STAGES = (
+    "record",
+    "pairs",
+    "train",
+    "ablations",
+    "tables",
+    "ship",
+    "precompute",
+    "policies",
+    "frontier",
+    "ship-policies",
+)
+"""In order. The steps of one of PARALLEL do not depend on each other."""
+PARALLEL = ("train", "ablations", "policies")
 
 ABLATIONS = {
     "ours-motion-network": "ours --estimate",
@@ -48,9 +61,6 @@ ABLATIONS = {
 }
 """Trained variants of the ablation table: arguments of scripts/train_extrapolator.py."""
 
-MAX_BYTES = 4_000_000
-"""Of one shipped file of weights."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -60,10 +70,12 @@ class Options:
     """Recordings (data/), trainings (unet-0/ ...), tables (table-rates/ ...), logs (train-all/) go here."""
     weights: Path = WEIGHTS
     """Where the weights are shipped to."""
-    stages: tuple[str, ...] = ("record", "pairs", "train", "tables", "ship")
-    """Which of record, pairs, train, ablations, tables, ship to do; table-ablation is a part of ablations."""
+    stages: tuple[str, ...] = tuple(stage for stage in STAGES if stage != "ablations")
+    """Which to do of record, pairs, train, ablations, tables, ship, precompute, policies, frontier,
+    ship-policies; table-ablation is a part of ablations."""
     seeds: int = 3
-    """Training seeds of each network; the first is shipped, the others tell how much training varies."""
+    """Training seeds of each network. The first one is shipped, of trigger policies the best on validation
+    drives; the others tell how much training varies."""
     train_sequences: int = 128
     """Training sequences, 10 s each."""
     val_sequences: int = 16
@@ -82,19 +94,6 @@ class Options:
         number("seeds", self.seeds, 1, 100)
         number("jobs", self.jobs, 1, 1024)
         choice("device", self.device, ("auto", "cpu", "cuda"))
-
-
-@dataclass(frozen=True)
-class Step:
-    """One command.
-
-    Attributes:
-        name: of its log and of its record.
-        command: script and arguments.
-    """
-
-    name: str
-    command: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -188,6 +187,12 @@ class Plan:
             return [self._ablation(name) for name in ABLATIONS]
         if stage == "tables":
             return self._tables()
+        if stage == "precompute":
+            return [self._precompute(split) for split in self.data]
+        if stage == "policies":
+            return [self._train_policy(policy, seed) for seed in range(options.seeds) for policy in POLICIES]
+        if stage == "frontier":
+            return [self._frontier()]
         return []
 
     def trained(self, network: Network, seed: int) -> Path:
@@ -197,6 +202,11 @@ class Plan:
     def results(self, table: str) -> Path:
         """What a table leaves."""
         return self.options.out / table / "results.json"
+
+    @property
+    def frontier(self) -> Path:
+        """Where the frontier is drawn."""
+        return self.options.out / "frontier"
 
     def _record(self, split: str, sequences: int, seconds: int) -> Step:
         command = f"scripts/record.py --split {split} --sequences {sequences} --duration {seconds}"
@@ -253,64 +263,45 @@ class Plan:
             for name, given in tables.items()
         ]
 
+    @property
+    def _extrapolator(self) -> str:
+        """That of the traces; their folders have its name, and sources tell it by its content."""
+        return str(self.options.weights / "unet.safetensors")
 
-class Runner:
-    """Runs steps, keeps their logs, and remembers which are finished.
+    def _traces(self, split: str) -> str:
+        return str(placed(default_folder(ROOT / self.data[split], self._extrapolator)))
 
-    Args:
-        folder: of the logs and records.
-    """
+    def _precompute(self, split: str) -> Step:
+        given = ("--data", str(self.data[split]), "--extrapolator", self._extrapolator)
+        more = ("--workers", str(self.options.jobs), "--out", self._traces(split), "--resume")
+        return Step(f"precompute-{split}", ("scripts/precompute.py", *given, *more))
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
+    def _train_policy(self, policy: Trained, seed: int) -> Step:
+        out = str(policy.weights(self.options.out, seed).parent)
+        if policy.family == "rl":
+            folders = {"recordings": str(self.data["train"]), "validation": str(self.data["val"])}
+            more = ["--extrapolator", self._extrapolator, "--resume"]
+        else:
+            folders = {"data": self._traces("train"), "validation": self._traces("val")}
+            more = ["--overwrite"]  # it takes a minute, and writes at its end
+        given = [part for name, path in folders.items() for part in (f"--{name}", path)]
+        command = (*policy.train, "--seed", str(seed), *given, *more, "--out", out)
+        return Step(f"train-{policy.family}-{seed}", command)
 
-    def run(self, steps: Sequence[Step], jobs: int) -> None:
-        """Run what is not finished, ``jobs`` at a time.
-
-        Raises:
-            RuntimeError: a step failed; the others of its stage are finished first.
-        """
-        waiting = [step for step in steps if not self.finished(step)]
-        with ThreadPoolExecutor(jobs) as pool:
-            running = [pool.submit(self._run, step) for step in waiting]
-            try:
-                failed = [step.name for step, ok in zip(waiting, running, strict=True) if not ok.result()]
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # an interrupt ends the commands under way by itself
-                raise
-        if failed:
-            raise RuntimeError(f"failed: {', '.join(failed)}; see the logs in {self.folder}")
-
-    def finished(self, step: Step) -> bool:
-        """Whether exactly this command has ended well before."""
-        record = self._record(step)
-        return record.is_file() and json.loads(record.read_text(encoding="utf-8"))["command"] == list(
-            step.command
-        )
-
-    def _record(self, step: Step) -> Path:
-        return self.folder / f"{step.name}.json"
-
-    def _run(self, step: Step) -> bool:
-        print(f"{step.name}: python {shlex.join(step.command)}", flush=True)
-        threads = dict.fromkeys(THREAD_VARIABLES, "1")
-        began = time.monotonic()
-        with open(self.folder / f"{step.name}.log", "ab") as log:
-            ended = subprocess.run(
-                [sys.executable, *step.command],
-                cwd=ROOT,
-                env={**os.environ, **threads},
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                check=False,
-            )
-        seconds = round(time.monotonic() - began, 1)
-        if ended.returncode == 0:
-            content = {"command": list(step.command), "seconds": seconds}
-            write_text(self._record(step), json.dumps(content, indent=1) + "\n")
-        print(f"{step.name}: exit status {ended.returncode} after {seconds} s", flush=True)
-        return ended.returncode == 0
+    def _frontier(self) -> Step:
+        names: list[str] = []
+        learned = {policy.family: policy for policy in POLICIES}
+        for row in ROWS:
+            policy = learned.get(parse_policy(row).family)
+            if policy is None:
+                names.append(row)
+                continue
+            seeds = range(self.options.seeds)
+            trained = (policy.weights(self.options.out, seed) for seed in seeds)
+            names += [f"{policy.family}@{path}:{policy.row}" for path in trained]
+        given = ("--policies", *names, "--every", "2", "--data", self._traces("test"))
+        more = ("--player", str(self.data["test"]), "--workers", str(self.options.jobs), "--resume")
+        return Step("frontier", ("scripts/frontier.py", *given, *more, "--out", str(self.frontier)))
 
 
 def placed(path: Path) -> Path:
@@ -329,29 +320,9 @@ def ship(plan: Plan) -> None:
     folder = ROOT / plan.options.weights
     folder.mkdir(parents=True, exist_ok=True)
     for network in NETWORKS:
-        source = ROOT / plan.trained(network, 0)
-        if source.stat().st_size > MAX_BYTES:
-            raise ValueError(
-                f"weights: found {source.stat().st_size} bytes in {source}, expected at most {MAX_BYTES}"
-            )
-        card = read_card(source)
-        if card is None:
-            raise FileNotFoundError(f"card: found no {card_path(source)}")
         table = json.loads((ROOT / plan.results(network.table)).read_text(encoding="utf-8"))
-        metrics = {**card.metrics, "test": measured(table, network)}
-        card = Card(**from_checkout(asdict(replace(card, metrics=metrics))))
-        target = folder / f"{network.name}.safetensors"
-        write_weights(target, read_tensors(source), card)
-        print(f"shipped: {target} ({target.stat().st_size / 1e6:.2f} MB)")
-
-
-def from_checkout(value: Any) -> Any:
-    """JSON-ready ``value`` with every path inside the checkout relative to it."""
-    if isinstance(value, dict):
-        return {key: from_checkout(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [from_checkout(item) for item in value]
-    return value.replace(f"{ROOT}{os.sep}", "") if isinstance(value, str) else value
+        source = ROOT / plan.trained(network, 0)
+        ship_weights(source, folder / f"{network.name}.safetensors", measured(table, network))
 
 
 def measured(table: Mapping[str, Any], network: Network) -> dict[str, Any]:
@@ -373,14 +344,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = tyro.cli(Options, args=given, description=__doc__)
         options.validate()
         options = replace(options, out=placed(options.out), weights=placed(options.weights))
-        plan, runner = Plan(options), Runner(ROOT / options.out / "train-all")
+        plan, runner = Plan(options), Runner(ROOT / options.out / "train-all", ROOT)
         for stage in STAGES:
             if stage not in options.stages:
                 continue
-            # Recording and tables use all cores by themselves.
-            runner.run(plan.steps(stage), options.jobs if stage in ("train", "ablations") else 1)
+            # The others use all cores by themselves.
+            runner.run(plan.steps(stage), options.jobs if stage in PARALLEL else 1)
             if stage == "ship":
                 ship(plan)
+            if stage == "ship-policies":
+                runs, weights = ROOT / options.out, ROOT / options.weights
+                ship_policies(shipping.Options(runs, ROOT / plan.frontier, weights, options.seeds))
 
     kept = "finished steps are kept"
     return run_command("train_all", work, arguments, kept=kept, again="", errors=(RuntimeError,))

@@ -5,7 +5,9 @@ python scripts/train_rl.py HYPERPARAMETERS, a file of agents/hyperparameters or 
   ppo-statistics    one small policy for all trigger costs, from event statistics
   dqn-statistics    the same with DQN
   qrdqn-statistics  the same with QR-DQN
-  ppo-dict          a small CNN with the state and the trigger cost beside the event frame
+  qrdqn-dict        one small CNN for all trigger costs, on the event frame, the sum of those since the held
+                    depth frame, the state and the cost
+  ppo-dict          the same with PPO
   ppo-image         a small CNN on event frames alone, for one trigger cost
 
 Traces come from scripts/precompute.py. Killed at any time, the same command with --resume goes on.
@@ -31,7 +33,7 @@ from gymnasium.vector import AutoresetMode
 
 import nl_env
 from agents.rl_training.hyperparameters import FOLDER, Hyperparameters, read_hyperparameters
-from agents.rl_training.training import Options, train
+from agents.rl_training.training import LAST, Options, train
 from agents.rl_training.validation import Validation
 from agents.sb3_vec_env import ReplayVecEnv
 from nl_env.batched_replay import BatchedReplayEnv
@@ -66,6 +68,8 @@ class Arguments:
     """Episodes end at LiDAR frames, which no decision reaches across, and are not discounted."""
     cost_offset: float = 0.05
     """Rewards are divided by the trigger cost plus this; 0 leaves them as they are."""
+    relative: bool = True
+    """Rewards count from what a depth frame of every slice would earn, which no decision changes."""
     mirror: bool = True
     """Half of the environments show their events mirrored."""
     recordings: Path = Path("runs/data/train")
@@ -83,7 +87,7 @@ class Arguments:
     overwrite: bool = False
     """Replace the run that is in the output folder."""
     resume: bool = False
-    """Continue the run that is in the output folder."""
+    """Continue the run that is in the output folder, or begin it."""
 
 
 def run(arguments: Arguments, command: str) -> Card:
@@ -98,6 +102,7 @@ def run(arguments: Arguments, command: str) -> Card:
         stages=arguments.stages,
         end_at_lidar=arguments.end_at_lidar,
         cost_offset=arguments.cost_offset or None,
+        relative=arguments.relative,
         mirror=arguments.mirror,
         target_rate=arguments.target_rate,
     )
@@ -135,13 +140,16 @@ def run(arguments: Arguments, command: str) -> Card:
             env,
             end_at_lidar=options.end_at_lidar,
             cost_offset=options.cost_offset,
+            relative=options.relative,
             mirror=options.mirror,
+            pictures=numbers.obs_mode in ("image", "dict"),
         )
 
     out = arguments.out or Path(f"runs/rl-{path.stem}-{arguments.seed}")
     claim(out, arguments.overwrite, arguments.resume)
     torch.set_num_threads(arguments.threads)
-    return train(options, hyperparameters, make_env, validation, out, card, resume=arguments.resume)
+    resume = arguments.resume and (out / LAST).is_file()  # else nothing is done yet
+    return train(options, hyperparameters, make_env, validation, out, card, resume=resume)
 
 
 def _adapted(numbers: Hyperparameters, arguments: Arguments) -> Hyperparameters:

@@ -1,7 +1,8 @@
 """Train a small network that says what a trigger is worth, from stored traces, and write it with a card.
 
 The traces come from scripts/precompute.py. A training takes a minute or two on one core; the same command
-gives the same weights. docs/policies.md compares the objectives.
+gives the same weights. With --pictures the network is a small CNN that sees event frames in place of
+statistics. docs/policies.md compares the objectives.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # agents/ is used from the checkout, wherever the command is started
@@ -21,6 +22,8 @@ import tyro
 
 import nl_env
 from agents.decisions import Decisions, collect
+from agents.picture_training import PictureDecisions, TrainedPictures, train_pictures
+from agents.rl_training.validation import Validation
 from agents.value_training import Trained, ValueTraining, train
 from nl_env.command_line import command_line, run_command
 from nl_env.config import number
@@ -36,6 +39,8 @@ class Options:
     """Train a small network that says what a trigger is worth."""
 
     training: Annotated[ValueTraining, tyro.conf.OmitArgPrefixes]
+    pictures: bool = False
+    """A CNN on pictures of event frames, obs_mode="dict", told the trigger cost whatever the objective."""
     data: Path = Path("runs/data/train-tables-unet")
     """Stored traces to learn from: a folder that scripts/precompute.py wrote."""
     validation: Path = Path("runs/data/val-tables-unet")
@@ -43,7 +48,7 @@ class Options:
     sequences: int | None = None
     """Only the first so many of the data."""
     out: Path | None = None
-    """Output folder. Default: runs/value-OBJECTIVE-SEED."""
+    """Output folder. Default: runs/value-OBJECTIVE-SEED, or runs/pictures-OBJECTIVE-SEED."""
     overwrite: bool = False
     """Replace the training that is in the output folder."""
 
@@ -54,11 +59,14 @@ def run(options: Options, command: str) -> Path:
     training.validate()
     if options.sequences is not None:
         number("sequences", options.sequences, 1, 10**6)
-    out = options.out or Path("runs") / f"value-{training.objective}-{training.seed}"
+    kind = "pictures" if options.pictures else "value"
+    out = options.out or Path("runs") / f"{kind}-{training.objective}-{training.seed}"
     weights = out / WEIGHTS
     if weights.exists() and not options.overwrite:
         raise FileExistsError(f"out: found {weights}; choose another folder, or overwrite it")
     torch.set_num_threads(1)
+    if options.pictures:
+        return run_pictures(options, weights, command)
     data = load(options.data, options.sequences)
     validation = load(options.validation, None)
     out.mkdir(parents=True, exist_ok=True)
@@ -70,6 +78,20 @@ def run(options: Options, command: str) -> Path:
         card(options, trained, data, validation, command, time.perf_counter() - start),
     )
     print(f"excess {1e5 * trained.best.excess:.1f}e-5 at step {trained.best.step}: {weights}")
+    return weights
+
+
+def run_pictures(options: Options, weights: Path, command: str) -> Path:
+    """As :func:`run`, on pictures."""
+    seeds = list(trace_files(options.data))[: options.sequences]
+    traces = list(open_traces(options.data, seeds).values())
+    validation = Validation.of(list(open_traces(options.validation).values()))
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    start = time.perf_counter()
+    trained = train_pictures(PictureDecisions.of(traces), validation, options.training, _report_regret)
+    seconds = time.perf_counter() - start
+    write_weights(weights, trained.network.state_dict(), picture_card(options, trained, command, seconds))
+    print(f"regret {trained.best.criterion:.4f} at step {trained.best_step}: {weights}")
     return weights
 
 
@@ -106,15 +128,7 @@ def card(
                 ("validation", options.validation, validation),
             )
         },
-        training={
-            "command": command,
-            **asdict(training),
-            "hidden": list(training.hidden),
-            "best_step": trained.best.step,
-            "seconds": round(seconds, 1),
-            "nl_env": nl_env.__version__,
-            "torch": torch.__version__,
-        },
+        training=_facts(options, command, trained.best.step, seconds),
         metrics={
             "validation_excess_log_mae": trained.best.excess,
             "history": [
@@ -125,6 +139,45 @@ def card(
     )
 
 
+def picture_card(options: Options, trained: TrainedPictures, command: str, seconds: float) -> Card:
+    """As :func:`card`, of a network on pictures."""
+    return Card(
+        what=f"trigger policy on pictures of event frames, objective {options.training.objective}",
+        architecture="trigger-network",
+        options=trained.network.options,
+        data={
+            name: {
+                "folder": str(folder),
+                "sequences": list(trace_files(folder))[:count],
+                "extrapolator": _extrapolator(folder),
+            }
+            for name, folder, count in (
+                ("train", options.data, options.sequences),
+                ("validation", options.validation, None),
+            )
+        },
+        training=_facts(options, command, trained.best_step, seconds),
+        metrics={
+            "validation": trained.best.metrics,
+            "history": [
+                {"step": step, "loss": loss, "regret": regret} for step, loss, regret in trained.history
+            ],
+        },
+    )
+
+
+def _facts(options: Options, command: str, best_step: int, seconds: float) -> dict[str, Any]:
+    return {
+        "command": command,
+        **asdict(options.training),
+        "hidden": list(options.training.hidden),
+        "best_step": best_step,
+        "seconds": round(seconds, 1),
+        "nl_env": nl_env.__version__,
+        "torch": torch.__version__,
+    }
+
+
 def _extrapolator(folder: Path) -> dict[str, str | bool]:
     """Whose errors the traces hold."""
     source = read_source(next(iter(trace_files(folder).values())))
@@ -133,6 +186,10 @@ def _extrapolator(folder: Path) -> dict[str, str | bool]:
 
 def _report(step: int, loss: float, excess: float) -> None:
     print(f"step {step}: loss {loss:.4f}, validation excess {1e5 * excess:.1f}e-5", flush=True)
+
+
+def _report_regret(step: int, loss: float, regret: float) -> None:
+    print(f"step {step}: loss {loss:.4f}, validation regret {regret:.4f}", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("types",),
     ("command_line", "config", "runs"),
-    ("scene", "sensors", "representations", "keyframes", "statistics", "costs"),
+    ("scene", "sensors", "representations", "keyframes", "statistics", "costs", "steps"),
     ("simulator",),
     ("recording", "weight_files"),
     ("elidar", "training"),

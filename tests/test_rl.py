@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3 import DQN, PPO
 
 from agents.rl import StatisticsTrigger, cost_for_rate, load_trigger
-from agents.rl_networks import TriggerNetwork, event_sums
+from agents.rl_networks import TriggerNetwork
 from agents.rl_training.hyperparameters import FOLDER, read_hyperparameters
 from agents.rl_training.models import decider, make_model, split, standardise
 from agents.rl_training.validation import Validation, play_schedules, play_together
@@ -68,7 +68,7 @@ def environment(stored):
             trigger_cost=numbers.trigger_cost,
             autoreset_mode=AutoresetMode.SAME_STEP,
         )
-        return ReplayVecEnv(env, end_at_lidar=True)
+        return ReplayVecEnv(env, end_at_lidar=True, pictures=numbers.obs_mode != "statistics")
 
     return make
 
@@ -93,7 +93,7 @@ def test_the_decider_does_what_the_trained_model_does(name, environment):
     for seen in observations:
         images, vector = split(seen)
         with torch.no_grad():
-            encoded = None if images is None else made.encode(event_sums(torch.from_numpy(images)))
+            encoded = None if images is None else made.encode(torch.from_numpy(images))
             margins = made(encoded, None if vector is None else torch.from_numpy(vector))
             values = preferences(model, model.policy.obs_to_tensor(seen)[0])
         torch.testing.assert_close(margins, values[:, 1] - values[:, 0], atol=1e-4, rtol=1e-4)
@@ -249,7 +249,7 @@ def test_networks_refuse_what_they_cannot_be():
         TriggerNetwork("statistics", False, [])
     with pytest.raises(ValueError, match="activation"):
         TriggerNetwork("statistics", False, [4], activation="gelu")
-    with pytest.raises(ValueError, match="at least 32 pixels"):
+    with pytest.raises(ValueError, match="multiples of 4 of at least 32 pixels"):
         TriggerNetwork("image", False, [4], height=16, width=160)
     with pytest.raises(ValueError, match="shows no image"):
-        network("statistics").encode(torch.zeros(1, 1, 120, 160))
+        network("statistics").encode(torch.zeros(1, 2, 30, 40))

@@ -48,7 +48,10 @@ def learn(stored, validation, tmp_path, monkeypatch):
             trigger_cost=numbers.trigger_cost,
             autoreset_mode=AutoresetMode.SAME_STEP,
         )
-        return ReplayVecEnv(env, end_at_lidar=True, cost_offset=0.05, mirror=True)
+        pictures = numbers.obs_mode != "statistics"
+        return ReplayVecEnv(
+            env, end_at_lidar=True, cost_offset=0.05, relative=True, mirror=True, pictures=pictures
+        )
 
     def run(
         name, file="ppo-statistics", resume=False, timesteps=120, options=None, algorithm=None, **changes
@@ -199,7 +202,8 @@ def test_every_file_of_hyperparameters_fits_its_algorithm_and_the_zoo(path, stor
             obs_mode=numbers.obs_mode,
             trigger_cost=numbers.trigger_cost,
             autoreset_mode=AutoresetMode.SAME_STEP,
-        )
+        ),
+        pictures=numbers.obs_mode != "statistics",
     )
     model = make_model(path.stem.split("-")[0], numbers, env, seed=0)
     assert model.policy.activation_fn is not None
@@ -256,6 +260,9 @@ def test_the_command_trains_and_refuses(stored, tmp_path, capsys):
     assert train_rl.main(command) == 2
     assert "already holds files" in capsys.readouterr().err
     assert train_rl.main([*command, "--resume"]) == 0
+    begun = tmp_path / "begun"
+    assert train_rl.main([*command[:-1], str(begun), "--resume"]) == 0
+    assert (begun / BEST).read_bytes() == (out / BEST).read_bytes()
     assert train_rl.main([*command, "--overwrite", "--sequences", "1"]) == 0
     assert json.loads((out / BEST).with_suffix(".json").read_text())["data"]["training"]["sequences"] == 1
     assert train_rl.main(["no-such-file", "--out", str(tmp_path / "x")]) == 2

@@ -5,6 +5,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from stored_traces import SLICES
 
+from agents.pictures import picture
 from agents.sb3_vec_env import ReplayVecEnv, mirrored
 from nl_env.batched_replay import BatchedReplayEnv
 from nl_env.observations import cost_coordinate
@@ -17,9 +18,11 @@ def batched(data, autoreset_mode=AutoresetMode.SAME_STEP, **arguments):
     return BatchedReplayEnv(ENVS, data=data, extrapolator="warp", autoreset_mode=autoreset_mode, **arguments)
 
 
-def make(data, end_at_lidar=False, cost_offset=None, mirror=False, **arguments):
+def make(data, end_at_lidar=False, cost_offset=None, mirror=False, relative=False, **arguments):
     env = batched(data, **arguments)
-    return ReplayVecEnv(env, end_at_lidar=end_at_lidar, cost_offset=cost_offset, mirror=mirror)
+    return ReplayVecEnv(
+        env, end_at_lidar=end_at_lidar, cost_offset=cost_offset, mirror=mirror, relative=relative
+    )
 
 
 def roll(env, steps=2 * SLICES, seed=3):
@@ -86,6 +89,29 @@ def test_rewards_can_be_divided_by_the_cost(stored):
         assert scaled.step(actions)[1] == pytest.approx(expected, rel=1e-5)
 
 
+def test_rewards_can_count_from_those_of_frames_of_every_slice(stored):
+    always = make(stored, relative=True, trigger_cost=0.5)
+    always.seed(1)
+    always.reset()
+    for k in range(1, 2 * SLICES + 1):  # past an end
+        expected = -0.5 if k % 5 else 0.0  # nothing but the trigger's cost
+        assert always.step(np.ones(ENVS, int))[1] == pytest.approx(np.full(ENVS, expected), abs=1e-6)
+
+
+def test_relative_rewards_differ_by_what_no_decision_changes(stored):
+    differences = []
+    for actions in (0, 1):
+        plain, relative = make(stored), make(stored, relative=True)
+        for env in (plain, relative):
+            env.seed(1)
+            env.reset()
+        chosen = np.full(ENVS, actions)
+        steps = [(plain.step(chosen)[1], relative.step(chosen)[1]) for _ in range(SLICES)]
+        differences.append([before - after for before, after in steps])
+    np.testing.assert_allclose(differences[0], differences[1], atol=1e-6)
+    assert np.ptp(differences[0]) > 0.01
+
+
 @pytest.mark.parametrize("obs_mode", ["dict", "statistics"])
 def test_every_lidar_interval_draws_its_cost(stored, obs_mode):
     env = make(stored, True, 0.05, obs_mode=obs_mode, trigger_cost=(0.01, 1.0))
@@ -147,6 +173,41 @@ def test_every_second_environment_is_mirrored(stored, obs_mode):
                 if obs_mode == "dict":
                     last, expected = last["event_frame"], expected["event_frame"]
                 np.testing.assert_array_equal(last, mirrored(expected) if i % 2 else expected)
+
+
+@pytest.mark.parametrize("obs_mode", ["image", "dict"])
+def test_pictures_are_those_of_the_frames_and_remember_since_the_held_depth(stored, obs_mode):
+    env = batched(stored, obs_mode=obs_mode)
+    pictures = ReplayVecEnv(env, mirror=True, pictures=True)
+    plain, records = roll(make(stored, mirror=True, obs_mode=obs_mode)), roll(pictures)
+    rng = np.random.default_rng(3)
+    sums = np.zeros((ENVS, 30, 40), int)
+    for k, (seen, shown) in enumerate(zip(plain, records, strict=True)):
+        frames, found = seen[0], shown[0]
+        if obs_mode == "dict":
+            np.testing.assert_array_equal(found["state"], frames["state"])
+            frames, found = frames["event_frame"], found["event_frame"]
+        assert found.shape == (ENVS, 3 if obs_mode == "dict" else 2, 30, 40)
+        np.testing.assert_array_equal(found[:, :2], picture(frames[:, 0]))
+        space = pictures.observation_space
+        assert (space["event_frame"] if obs_mode == "dict" else space).contains(found[0])
+        index = k % SLICES + 1  # of the slice that is seen, which the next actions are for
+        sums = (0 if index == 1 else sums) + found[:, 1].astype(int)
+        sums[:] *= index % 5 != 0  # a LiDAR frame arrives
+        if obs_mode == "dict":
+            np.testing.assert_array_equal(found[:, 2], np.minimum(sums, 127))
+        for i in np.flatnonzero(shown[2]):
+            last, before = shown[3][i]["terminal_observation"], records[k - 1][0]
+            np.testing.assert_equal(
+                last["event_frame"] if obs_mode == "dict" else last,
+                before["event_frame"][i] if obs_mode == "dict" else before[i],
+            )
+        sums[rng.integers(2, size=ENVS) == 1] = 0
+
+
+def test_pictures_need_event_frames(stored):
+    with pytest.raises(ValueError, match="expected obs_mode 'image' or 'dict'"):
+        ReplayVecEnv(batched(stored, obs_mode="statistics"), pictures=True)
 
 
 def test_the_cost_can_be_set_while_running(stored):

@@ -5,9 +5,22 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from nl_env.steps import Runner, Step
 from nl_env.weight_files import Card, read_card, read_tensors, write_weights
-from scripts import record, reproduce, train_all, train_extrapolator, train_keyframe
-from scripts.train_all import ABLATIONS, NETWORKS, STAGES, Options, Plan, Runner, Step, ship
+from scripts import (
+    frontier,
+    precompute,
+    record,
+    reproduce,
+    ship,
+    train_all,
+    train_extrapolator,
+    train_keyframe,
+    train_rl,
+    train_value,
+)
+from scripts.ship import POLICIES
+from scripts.train_all import ABLATIONS, NETWORKS, STAGES, Options, Plan
 
 
 @pytest.fixture
@@ -55,23 +68,58 @@ def test_ablations_are_trained_and_measured_on_request(tmp_path):
         assert f"{folder}/extrapolator.safetensors" in table.command
 
 
+def after(command, option):
+    return command[command.index(option) + 1]
+
+
+def test_every_policy_is_trained_on_the_stored_traces_and_takes_part_in_the_frontier(plan):
+    stored = {
+        after(step.command, "--data"): after(step.command, "--out") for step in plan.steps("precompute")
+    }
+    assert set(stored) == {str(folder) for folder in plan.data.values()}
+    trained = set()
+    for step in plan.steps("policies"):
+        command = step.command
+        if "--data" in command:
+            assert after(command, "--data") == stored[str(plan.data["train"])]
+            assert after(command, "--validation") == stored[str(plan.data["val"])]
+        else:
+            assert after(command, "--recordings") == str(plan.data["train"])
+            assert (
+                str(train_rl.default_folder(plan.data["train"], after(command, "--extrapolator")))
+                in stored.values()
+            )
+        trained.add(after(command, "--out"))
+    (step,) = plan.steps("frontier")
+    assert after(step.command, "--data") == stored[str(plan.data["test"])]
+    taking_part = {part.partition("@")[2].rpartition(":")[0] for part in step.command if "@" in part}
+    wanted = {policy.weights(plan.options.out, seed) for policy in POLICIES for seed in (0, 1)}
+    assert taking_part == {str(path) for path in wanted}
+    assert trained == {str(path.parent) for path in wanted}
+
+
 def test_every_planned_command_is_understood_by_its_script(tmp_path, monkeypatch):
     """Parsed by the scripts themselves, with the work replaced."""
     done = []
 
     def work(*arguments):
         done.append(arguments)
-        return SimpleNamespace(metrics={"at_thresholds": {}})
+        return SimpleNamespace(
+            metrics={"at_thresholds": {}, "validation": {}}, training={"steps": 1, "steps_in_all": 1}
+        )
 
-    monkeypatch.setattr(record, "run", work)
-    monkeypatch.setattr(train_keyframe, "run", work)
+    for module in (record, train_keyframe, precompute, train_value, train_rl, frontier):
+        monkeypatch.setattr(module, "run", work)
     for command in ("PairsCommand", "Ours", "Paper"):
         monkeypatch.setattr(getattr(train_extrapolator, command), "run", work)
     for table in ("TableKeyframe", "TableRates", "TableAblation", "TableEndToEnd"):
         monkeypatch.setattr(getattr(reproduce, table), "run", work)
     scripts = {
         f"scripts/{module.__name__.split('.')[-1]}.py": module
-        for module in (record, train_extrapolator, train_keyframe, reproduce)
+        for module in (
+            *(record, train_extrapolator, train_keyframe, reproduce),
+            *(precompute, train_value, train_rl, frontier),
+        )
     }
     plan = Plan(Options(out=tmp_path, stages=STAGES, seeds=1, device="cpu"))
     steps = [step for stage in STAGES for step in plan.steps(stage)]
@@ -82,7 +130,7 @@ def test_every_planned_command_is_understood_by_its_script(tmp_path, monkeypatch
 
 def test_finished_steps_are_not_repeated_and_changed_ones_are(tmp_path):
     code = f"open({str(tmp_path / 'count')!r}, 'a').write('x')"
-    runner = Runner(tmp_path / "steps")
+    runner = Runner(tmp_path / "steps", tmp_path)
     step = Step("count", ("-c", code))
     for _ in range(2):
         runner.run([step], 1)
@@ -92,7 +140,7 @@ def test_finished_steps_are_not_repeated_and_changed_ones_are(tmp_path):
 
 
 def test_a_failed_step_is_named_and_done_again(tmp_path):
-    runner = Runner(tmp_path / "steps")
+    runner = Runner(tmp_path / "steps", tmp_path)
     good, bad = Step("good", ("-c", "print('fine')")), Step("bad", ("-c", "raise SystemExit(3)"))
     with pytest.raises(RuntimeError, match="failed: bad"):
         runner.run([bad, good], 2)
@@ -112,13 +160,13 @@ def test_an_interrupt_starts_nothing_more(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Runner, "_run", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        Runner(tmp_path).run([Step("one", ()), Step("two", ()), Step("three", ())], 1)
+        Runner(tmp_path, tmp_path).run([Step("one", ()), Step("two", ()), Step("three", ())], 1)
     assert started[0] == "one" and "three" not in started
 
 
 def test_the_first_seed_is_shipped_with_what_was_measured(plan):
     write_trained(plan)
-    ship(plan)
+    train_all.ship(plan)
     for network in NETWORKS:
         path = plan.options.weights / f"{network.name}.safetensors"
         assert read_tensors(path)["x"].tolist() == [0.0] * 3
@@ -131,13 +179,13 @@ def test_the_first_seed_is_shipped_with_what_was_measured(plan):
 
 def test_nothing_too_large_or_unmeasured_is_shipped(plan, monkeypatch):
     write_trained(plan)
-    monkeypatch.setattr(train_all, "MAX_BYTES", 50)
+    monkeypatch.setattr(ship, "MAX_BYTES", 50)
     with pytest.raises(ValueError, match=r"unet-0.*expected at most 50"):
-        ship(plan)
+        train_all.ship(plan)
     monkeypatch.undo()
     plan.results("table-keyframe").unlink()
     with pytest.raises(FileNotFoundError, match="table-keyframe"):
-        ship(plan)
+        train_all.ship(plan)
 
 
 @pytest.mark.parametrize(

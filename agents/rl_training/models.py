@@ -14,7 +14,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from agents.rl_networks import ACTIVATIONS, Encoder, TriggerNetwork, event_sums
+from agents.pictures import POOL
+from agents.rl_networks import ACTIVATIONS, Encoder, TriggerNetwork
 from agents.rl_training.hyperparameters import Hyperparameters, scheduled
 from nl_env.config import choice
 
@@ -33,14 +34,12 @@ class TriggerFeatures(BaseFeaturesExtractor):
     def forward(self, observations: Any) -> Tensor:
         """Features ``(n, size)`` of a batch of observations."""
         images, vector = split(observations)
-        encoded = (
-            None if images is None or self.encoder.image is None else self.encoder.image(event_sums(images))
-        )
+        encoded = None if images is None or self.encoder.image is None else self.encoder.image(images)
         return self.encoder(encoded, vector)
 
 
 def split(observations: Any) -> tuple[Any, Any]:
-    """Images and numbers of a batch of observations, of which a mode may lack one; tensors or arrays."""
+    """Pictures and numbers of a batch of observations, of which a mode may lack one; tensors or arrays."""
     if isinstance(observations, dict):
         parts = [observations[name] for name in ("state", "trigger_cost") if name in observations]
         vector = torch.cat(parts, -1) if isinstance(parts[0], Tensor) else np.concatenate(parts, axis=-1)
@@ -49,12 +48,12 @@ def split(observations: Any) -> tuple[Any, Any]:
 
 
 def image_size(space: spaces.Space[Any]) -> tuple[int, int]:
-    """``(H, W)`` of the event frames in ``space``; zeros where there are none."""
+    """``(H, W)`` of the event frames behind the pictures in ``space``; zeros where there are none."""
     if isinstance(space, spaces.Dict):
         space = space["event_frame"]
     assert isinstance(space, spaces.Box)
     height, width = space.shape[-2:] if len(space.shape) == 3 else (0, 0)
-    return height, width
+    return height * POOL, width * POOL
 
 
 def make_model(

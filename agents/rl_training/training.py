@@ -51,7 +51,7 @@ class Options:
         algorithm: one of :data:`agents.rl_training.models.ALGORITHMS`.
         seed: of weights, environments and draws.
         stages: validations and checkpoints; fewer where a stage would not last for whole sequences.
-        end_at_lidar, cost_offset, mirror: of :class:`agents.sb3_vec_env.ReplayVecEnv`.
+        end_at_lidar, cost_offset, relative, mirror: of :class:`agents.sb3_vec_env.ReplayVecEnv`.
         target_rate: effective frame rate to keep, Hz; the trigger cost is then adapted.
     """
 
@@ -60,6 +60,7 @@ class Options:
     stages: int = 20
     end_at_lidar: bool = True
     cost_offset: float | None = 0.05
+    relative: bool = True
     mirror: bool = True
     target_rate: float | None = None
 

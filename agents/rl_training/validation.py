@@ -12,7 +12,8 @@ from torch import Tensor
 
 from agents.base import Policy
 from agents.oracle import oracle_curve
-from agents.rl_networks import TriggerNetwork, event_sums
+from agents.pictures import MAGNITUDES, picture, with_memory
+from agents.rl_networks import TriggerNetwork
 from agents.rules import Evenly, Periodic
 from nl_env.batched_ledger import BatchedLedger
 from nl_env.evaluation import DECIDING_METRIC
@@ -25,8 +26,6 @@ from nl_env.types import SLICE_US
 PERIODS = (1, 2, 3, 4, 6, 8)
 RATES_HZ = (15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
 """Periodic and even schedules whose common curve has regret 1."""
-BLOCK = 256
-"""Images that are encoded together."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,10 @@ def play_together(
 
     def decide(k: int, arrives: NDArray[np.bool_], ledger: BatchedLedger) -> NDArray[np.int64]:
         activity.act(ledger.held_index == k - 1)
-        vector = None
+        vector, column = None, np.zeros(count, np.int64)
         if network.obs_mode != "image":
             since_lidar, since_depth = ledger.staleness(np.full(count, k), arrives)
+            column = np.where(arrives, 0, k - ledger.held_index - 1)
             vector = state_vector(since_lidar, since_depth, events[sequence, k], pixels, ledger.last_action)
             if described is not None:
                 activity.see(described[sequence, k], arrives)
@@ -120,7 +120,7 @@ def play_together(
         images = next(encoded)
         with torch.inference_mode():
             margins = network(
-                None if images is None else images[sequence],
+                None if images is None else images[sequence, column],
                 None if vector is None else torch.from_numpy(vector),
             )
             return (margins + added > 0).numpy().astype(np.int64)
@@ -161,24 +161,26 @@ def _play(traces: Sequence[SequenceTrace], points: int, decide: Decide) -> Opera
 
 
 def _encoded(network: TriggerNetwork, traces: Sequence[SequenceTrace]) -> Iterator[Tensor | None]:
-    """For every slice from 1 on the ``(sequences, size)`` encoded images, or None where there are none."""
+    """For every slice from 1 on ``(sequences, ages, size)`` encoded pictures, or None where there are none.
+
+    In mode ``"dict"`` pictures depend on how many slices ago the held frame was made: column 0 is 1 slice,
+    and the only one where a LiDAR frame arrives.
+    """
     if network.encoder.image is None:
         yield from [None] * traces[0].slices
         return
-    with torch.inference_mode():
-        encoded = torch.stack(
-            [
-                torch.cat(
-                    [
-                        network.encode(event_sums(torch.tensor(trace.images[first : first + BLOCK]))[:, None])
-                        for first in range(1, len(trace.images), BLOCK)
-                    ]
-                )
-                for trace in traces
-            ],
-            dim=1,
-        )
-    yield from encoded
+    period = traces[0].lidar_period
+    magnitudes: list[NDArray[np.int8]] = []  # of the slices since the last LiDAR frame, newest first
+    for k in range(1, traces[0].slices + 1):
+        shown = picture(np.stack([trace.images[k] for trace in traces]))[:, None]
+        if network.obs_mode == "dict":
+            newest = shown[:, 0, MAGNITUDES]
+            magnitudes = [newest, *magnitudes] if k % period else []
+            sums = np.cumsum(magnitudes or [np.zeros_like(newest)], axis=0, dtype=np.int64)
+            shown = with_memory(np.repeat(shown, len(sums), axis=1), np.moveaxis(sums, 0, 1))
+        with torch.inference_mode():
+            encoded = network.encode(torch.from_numpy(shown.reshape(-1, *shown.shape[2:])))
+        yield encoded.reshape(*shown.shape[:2], -1)
 
 
 def means(points: OperatingPoints) -> Mapping[str, list[float]]:
