@@ -15,7 +15,14 @@ from torch.nn import functional
 from agents.keyframe_cnn import KeyframeCNN, average_down, block_length, probability
 from agents.keyframe_data import FrameSource, Slices
 from agents.keyframe_networks import Detector, TemporalDetector
-from nl_env.classification import Detection, auroc, best_f1_threshold, matching_threshold, rate_threshold
+from nl_env.classification import (
+    Detection,
+    auroc,
+    best_f1_threshold,
+    even_threshold,
+    matching_threshold,
+    rate_threshold,
+)
 from nl_env.config import number
 from nl_env.training.task import Forward
 
@@ -315,13 +322,15 @@ def detect(network: Detector, data: FrameSource, threads: int | None = None) -> 
 def calibrate(detections: Sequence[Detection], rate_hz: float = RATE_HZ) -> dict[str, float]:
     """Thresholds for a card.
 
-    ``f1`` has the best F1; ``rate`` keeps the mean effective rate to ``rate_hz``; ``matching`` triggers as
-    often as there are keyframes, and is the ``default``.
+    ``f1`` has the best F1; ``rate`` keeps the mean effective rate to ``rate_hz``; ``even`` finds as large a
+    share of the keyframes as it leaves alone of the other slices; ``matching`` triggers as often as there are
+    keyframes, and is the ``default``.
     """
     matching = matching_threshold(detections)
     return {
         "f1": best_f1_threshold(detections),
         "rate": rate_threshold(detections, rate_hz),
+        "even": even_threshold(detections),
         "matching": matching,
         "default": matching,
     }

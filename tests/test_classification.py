@@ -7,6 +7,7 @@ from nl_env.classification import (
     best_f1_threshold,
     confusion,
     effective_rate,
+    even_threshold,
     matching_threshold,
     rate_threshold,
     summarise_detector,
@@ -122,6 +123,27 @@ def test_the_matching_threshold_calls_as_many_keyframes_as_there_are():
     assert 0.5 <= matching_threshold([tied]) < 0.7  # one trigger rather than three
 
 
+def test_the_even_threshold_errs_alike_on_keyframes_and_others():
+    def uneven(threshold):
+        summary = summarise_detector(DETECTIONS, threshold, RESAMPLES[:2])
+        return abs(summary.recall.mean - (1 - summary.false_positive_rate.mean))
+
+    scores = np.concatenate([d.scores for d in DETECTIONS])
+    found = uneven(even_threshold(DETECTIONS))
+    assert found < 0.02
+    assert all(found <= uneven(score) + 1e-12 for score in scores)
+    tied = detection(0, scores=[0.7, 0.5, 0.5, 0.2], keyframe=[True, True, False, False])
+    assert 0.5 <= even_threshold([tied]) < 0.7
+
+
+def test_the_even_threshold_does_not_depend_on_the_share_of_keyframes():
+    scores, keyframe = [0.9, 0.7, 0.4, 0.6, 0.3, 0.1], [True] * 3 + [False] * 3
+    rare = detection(0, scores=scores + [0.6, 0.3, 0.1] * 5, keyframe=keyframe + [False] * 15)
+    common = detection(0, scores=scores + [0.9, 0.7, 0.4] * 5, keyframe=keyframe + [True] * 15)
+    assert even_threshold([rare]) == even_threshold([common])
+    assert best_f1_threshold([rare]) > best_f1_threshold([common])
+
+
 @pytest.mark.parametrize("rate", [15, 30.0, 41, 49.9, 50])
 def test_the_rate_threshold_spends_the_rate_and_no_more(rate):
     threshold = rate_threshold(DETECTIONS, rate)
@@ -143,6 +165,8 @@ def test_the_rate_threshold_with_no_room_for_a_trigger():
         (lambda: detection(0, scores=[0.1, np.nan], keyframe=[True, False]), "not finite"),
         (lambda: detection(0, scores=[0.1], keyframe=[True, False]), "found scores"),
         (lambda: best_f1_threshold([detection(0, keyframe=[False] * SLICES)]), "no keyframe"),
+        (lambda: even_threshold([detection(0, keyframe=[False] * SLICES)]), "no keyframe"),
+        (lambda: even_threshold([detection(0, keyframe=[True] * SLICES)]), "keyframes alone"),
         (lambda: summarise_detector([], 0.5, RESAMPLES), "0 sequences"),
         (lambda: summarise_detector(DETECTIONS[:2], 0.5, RESAMPLES), "2 sequences"),
     ],

@@ -307,7 +307,7 @@ def test_the_script_trains_calibrates_and_resumes(tmp_path, recipe, capsys):
     card = read_card(weights)
     assert card.data["training"]["sequences"] == 4 and card.data["validation"]["first_seed"] == 9
     assert KeyframeCNN.load(weights).threshold == card.metrics["thresholds"]["default"]
-    assert set(card.metrics["at_thresholds"]) == {"f1", "rate", "matching"}
+    assert set(card.metrics["at_thresholds"]) == {"f1", "rate", "matching", "even"}
     before = weights.read_bytes()
     assert script.main(arguments) == 2
     assert "already holds a run" in capsys.readouterr().err
