@@ -124,22 +124,12 @@ def _keyframes(weights: str) -> Family:
     )
 
 
-def _values(weights: str) -> Family:
+def _told_cost(load: Callable[[Path, float | None], Policy], weights: str, default: float | None) -> Family:
     return Family(
-        load=_trigger_value,
+        load=load,
         weights=weights,
         parameter="cost of a trigger, in units of reward",
-        default=0.1,
-        sweep=_COSTS,
-    )
-
-
-def _triggers(weights: str) -> Family:
-    return Family(
-        load=_trigger_network,
-        weights=weights,
-        parameter="cost of a trigger, in units of reward",
-        default=None,
+        default=default,
         sweep=_COSTS,
     )
 
@@ -211,12 +201,12 @@ FAMILIES: dict[str, Family] = {
         default=0.005,
         sweep=_SAVINGS,
     ),
-    "value-advantage": _values("value-advantage.safetensors"),
-    "value-clone": _values("value-clone.safetensors"),
-    "value-planned": _values("value-planned.safetensors"),
-    "value-pictures": _triggers("value-pictures.safetensors"),
-    "rl": _triggers("rl.safetensors"),
-    "rl-pictures": _triggers("rl-pictures.safetensors"),
+    "value-advantage": _told_cost(_trigger_value, "value-advantage.safetensors", 0.1),
+    "value-clone": _told_cost(_trigger_value, "value-clone.safetensors", 0.1),
+    "value-planned": _told_cost(_trigger_value, "value-planned.safetensors", 0.1),
+    "value-pictures": _told_cost(_trigger_network, "value-pictures.safetensors", None),
+    "rl": _told_cost(_trigger_network, "rl.safetensors", None),
+    "rl-pictures": _told_cost(_trigger_network, "rl-pictures.safetensors", None),
     "keyframe-rule": Family(lambda _, seed: KeyframeRule()),
     "greedy": Family(
         lambda threshold, seed: GreedyDepthChange(threshold),

@@ -6,7 +6,6 @@ with the memory of :mod:`agents.pictures`, in place of event statistics.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from agents.pictures import MAGNITUDES, POOL, picture, with_memory
 from agents.rl_networks import TriggerNetwork
 from agents.rl_training.judgement import ByRegret, Verdict
 from agents.rl_training.validation import Validation
-from agents.value_training import ValueTraining, draw_costs, objective_loss, share_of_rate
+from agents.supervised import ValueTraining, descend, draw_costs, told
+from agents.value_training import objective_loss
 from nl_env.observations import STATE_FIELDS, cost_coordinate
 from nl_env.traces import SequenceTrace
 
@@ -109,43 +109,24 @@ def train_pictures(
     rng = torch.Generator().manual_seed(options.seed)
     errors = torch.from_numpy(np.nan_to_num(data.errors)).float()
     network = _network(options, data, rng)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: share_of_rate(step, options.steps))
-    best, best_step, weights = None, 0, network.state_dict()
-    history, losses = [], []
-    for step in range(1, options.steps + 1):
+
+    def loss() -> Tensor:
         drawn = torch.randint(2 * len(errors), (options.batch,), generator=rng)
         chosen, mirrored = drawn % len(errors), drawn >= len(errors)
         costs = draw_costs(options, rng)
         shown = torch.from_numpy(data.shown(chosen.numpy(), mirrored.numpy()))
         encoded = network.encode(shown.flatten(0, 1))
-        output = network(encoded, _told(data.state[chosen.numpy()], costs).flatten(0, 1))
-        loss = objective_loss(output.view(len(chosen), -1), errors[chosen], costs, options)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if step % options.evaluate_every == 0 or step == options.steps:
-            verdict = ByRegret()(network.eval(), validation)
-            network.train()
-            history.append((step, float(np.mean(losses)), verdict.criterion))
-            progress(*history[-1])
-            losses = []
-            if best is None or verdict.criterion < best.criterion:
-                best, best_step, weights = verdict, step, copy.deepcopy(network.state_dict())
-    assert best is not None
-    network.load_state_dict(weights)
-    return TrainedPictures(network.eval(), best, best_step, tuple(history))
+        state = torch.from_numpy(data.state[chosen.numpy()])
+        output = network(encoded, told(state, costs).flatten(0, 1))
+        return objective_loss(output.view(len(chosen), -1), errors[chosen], costs, options)
 
+    def judge(step: int) -> tuple[float, tuple[int, Verdict]]:
+        verdict = ByRegret()(network.eval(), validation)
+        network.train()
+        return verdict.criterion, (step, verdict)
 
-def _told(state: NDArray[np.float32], costs: Tensor) -> Tensor:
-    """States ``(m, states, 4)`` with the costs ``(m,)`` as the last field."""
-    shown = torch.from_numpy(np.asarray(cost_coordinate(costs.numpy())))
-    return torch.cat([torch.from_numpy(state), shown[:, None, None].expand(-1, state.shape[1], 1)], dim=-1)
+    (best_step, best), history = descend(network, options, loss, judge, progress)
+    return TrainedPictures(network.eval(), best, best_step, history)
 
 
 def _network(options: ValueTraining, data: PictureDecisions, rng: torch.Generator) -> TriggerNetwork:

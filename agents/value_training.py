@@ -18,7 +18,6 @@ Objectives:
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,62 +28,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.decisions import Decisions, states
+from agents.supervised import ValueTraining, descend, draw_costs, told
 from agents.value_network import ValueNetwork
-from nl_env.config import choice, number
-from nl_env.frontier import Curve, lower_hull
+from nl_env.curves import Curve, lower_hull
 from nl_env.observations import cost_coordinate
 
-OBJECTIVES = ("reduction", "advantage", "clone", "planned")
 VALIDATION_POINTS = 24
 """Operating points of the curve by which checkpoints are chosen."""
-
-
-@dataclass(frozen=True)
-class ValueTraining:
-    """How a value network is trained."""
-
-    objective: str = "planned"
-    """reduction, advantage, clone or planned."""
-    hidden: tuple[int, ...] = (48, 24)
-    """Widths of the hidden layers."""
-    steps: int = 1200
-    """Optimiser steps."""
-    batch: int = 128
-    """LiDAR intervals per step; all states of each."""
-    learning_rate: float = 2e-3
-    """Peak, reached after a tenth of the steps; a cosine brings it down to 0."""
-    weight_decay: float = 1e-2
-    """AdamW's."""
-    dropout: float = 0.0
-    """Share of activity inputs that are replaced by their mean in training."""
-    cost_low: float = 1e-3
-    """Lowest trigger cost, in units of reward."""
-    cost_high: float = 3.0
-    """Highest trigger cost."""
-    error_scale: float = 0.05
-    """The log_mae that costs as much as a trigger of cost 1; as the environment's."""
-    evaluate_every: int = 100
-    """Steps between evaluations on the validation decisions; the best is kept."""
-    seed: int = 0
-    """Of the initial weights and of the batches."""
-
-    def validate(self) -> None:
-        """Raise ``ValueError`` naming the option, what was found and what was expected."""
-        choice("objective", self.objective, OBJECTIVES)
-        number("steps", self.steps, 1, 10**7)
-        number("batch", self.batch, 1, 10**6)
-        number("learning_rate", self.learning_rate, 0.0, 1.0)
-        number("weight_decay", self.weight_decay, 0.0, 10.0)
-        number("dropout", self.dropout, 0.0, 0.9)
-        number("cost_low", self.cost_low, 1e-4, self.cost_high)
-        number("cost_high", self.cost_high, self.cost_low, 1e2)
-        number("error_scale", self.error_scale, 1e-9, 1e9)
-        number("evaluate_every", self.evaluate_every, 1, 10**7)
-
-    @property
-    def conditioned(self) -> bool:
-        """Whether the network is told the trigger cost."""
-        return self.objective != "reduction"
 
 
 @dataclass(frozen=True)
@@ -131,34 +81,19 @@ def train(
     rng = torch.Generator().manual_seed(options.seed)
     observations, errors = _with_mirror(data)
     network = _network(options, observations, errors, rng)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: share_of_rate(step, options.steps))
     floor = oracle_curve(validation)
-    best: Evaluation | None = None
-    weights = network.state_dict()
-    history, losses = [], []
-    for step in range(1, options.steps + 1):
+
+    def loss() -> Tensor:
         chosen = torch.randint(len(errors), (options.batch,), generator=rng)
         costs = draw_costs(options, rng)
-        loss = _loss(network, observations[chosen], errors[chosen], costs, options, rng)
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        if step % options.evaluate_every == 0 or step == options.steps:
-            found = evaluate(network, validation, floor, step)
-            history.append((step, float(np.mean(losses)), found.excess))
-            progress(*history[-1])
-            losses = []
-            if best is None or found.excess < best.excess:
-                best, weights = found, copy.deepcopy(network.state_dict())
-    assert best is not None
-    network.load_state_dict(weights)
-    return Trained(network.eval(), best, tuple(history))
+        return _loss(network, observations[chosen], errors[chosen], costs, options, rng)
+
+    def judge(step: int) -> tuple[float, Evaluation]:
+        found = evaluate(network, validation, floor, step)
+        return found.excess, found
+
+    best, history = descend(network, options, loss, judge, progress)
+    return Trained(network.eval(), best, history)
 
 
 def plan(errors: Tensor, price: Tensor, probabilities: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -225,7 +160,7 @@ def evaluate(network: ValueNetwork, decisions: Decisions, floor: Curve, step: in
         if network.conditioned:
             low, high = network.cost_range
             chosen = [
-                network(_told(observations, torch.full((len(observations),), float(cost)))).numpy() > 0
+                network(told(observations, torch.full((len(observations),), float(cost)))).numpy() > 0
                 for cost in np.geomspace(low, high, VALIDATION_POINTS)
             ]
         else:
@@ -287,18 +222,6 @@ def _with_mirror(data: Decisions) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(observations), torch.from_numpy(np.nan_to_num(errors)).float()
 
 
-def draw_costs(options: ValueTraining, rng: torch.Generator) -> Tensor:
-    """A trigger cost for every interval of a batch."""
-    low, high = math.log(options.cost_low), math.log(options.cost_high)
-    return torch.exp(low + (high - low) * torch.rand(options.batch, generator=rng))
-
-
-def _told(observations: Tensor, costs: Tensor) -> Tensor:
-    """Observations ``(n, states, fields)`` with the costs ``(n,)`` as the last field."""
-    shown = torch.from_numpy(np.asarray(cost_coordinate(costs.numpy())))
-    return torch.cat([observations, shown[:, None, None].expand(-1, observations.shape[1], 1)], dim=-1)
-
-
 def _diagonal(errors: Tensor) -> Tensor:
     """``(n, states)`` error that a trigger saves at once."""
     return torch.stack([errors[:, k, h] - errors[:, k, k] for k, h in states(errors.shape[1])], dim=1)
@@ -313,7 +236,7 @@ def _loss(
     rng: torch.Generator,
 ) -> Tensor:
     """Mean loss of one batch."""
-    seen = _told(observations, costs) if options.conditioned else observations
+    seen = told(observations, costs) if options.conditioned else observations
     if options.dropout:
         kept = torch.rand(len(seen), 1, seen.shape[-1], generator=rng) >= options.dropout
         kept[..., -1] |= options.conditioned
@@ -349,9 +272,3 @@ def objective_loss(output: Tensor, errors: Tensor, costs: Tensor, options: Value
 
 PRICE_OFFSET = 2e-3
 """Totals are divided by the price plus this error, about what a trigger saves in slow traffic."""
-
-
-def share_of_rate(step: int, steps: int) -> float:
-    """Share of the peak learning rate at ``step`` (from 0 on) of ``steps``."""
-    warm = max(1, steps // 10)
-    return min((step + 1) / warm, 0.5 * (1 + math.cos(math.pi * step / steps)))

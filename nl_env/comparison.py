@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nl_env.curves import OperatingPoints, oracle_points
 from nl_env.evaluation import (
     DECIDING_METRIC,
     EnergyModel,
@@ -23,7 +24,7 @@ from nl_env.evaluation import (
     resample_sequences,
     summarise,
 )
-from nl_env.frontier import ENDS, ORACLE, PERIODIC, Frontier, OperatingPoints, frontier, oracle_points
+from nl_env.frontier import ENDS, ORACLE, PERIODIC, Frontier, frontier
 from nl_env.traces import PlayerFrames, SequenceTrace
 from nl_env.types import SLICE_US, TriggerPolicy
 

@@ -24,7 +24,8 @@ import nl_env
 from agents.decisions import Decisions, collect
 from agents.picture_training import PictureDecisions, TrainedPictures, train_pictures
 from agents.rl_training.validation import Validation
-from agents.value_training import Trained, ValueTraining, train
+from agents.supervised import ValueTraining
+from agents.value_training import Trained, train
 from nl_env.command_line import command_line, run_command
 from nl_env.config import number
 from nl_env.trace_files import open_traces, read_source, trace_files

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from nl_env.comparison import pooled_floor
-from nl_env.frontier import (
-    MATCHED_RATES,
-    Curve,
-    OperatingPoints,
-    frontier,
-    lower_hull,
-    oracle_points,
-)
+from nl_env.curves import Curve, OperatingPoints, lower_hull, oracle_points
+from nl_env.frontier import MATCHED_RATES, frontier
 
 ENDS = OperatingPoints(np.array([[10.0, 10.0], [50.0, 50.0]]), np.array([[5.0, 7.0], [1.0, 1.0]]))
 """Two sequences, errors 6 and 1 on average at 10 and 50 Hz."""

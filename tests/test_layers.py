@@ -28,7 +28,7 @@ LAYERS = (
     ("driving", "indoor_env", "replay"),
     ("batched_replay",),
     ("wrappers",),
-    ("evaluation", "realism"),
+    ("curves", "evaluation", "realism"),
     ("classification", "frontier"),
     ("comparison",),
     ("frame_rates",),

@@ -12,7 +12,7 @@ from agents.decisions import states
 from agents.picture_training import PictureDecisions, train_pictures
 from agents.rl_training.validation import Validation
 from agents.sb3_vec_env import ReplayVecEnv
-from agents.value_training import OBJECTIVES, ValueTraining
+from agents.supervised import OBJECTIVES, ValueTraining
 from nl_env.batched_replay import BatchedReplayEnv
 from nl_env.evaluation import play
 from nl_env.trace_files import default_folder, open_traces

@@ -13,9 +13,10 @@ from agents.keyframe_cnn import KeyframeCNN
 from agents.keyframe_networks import FrameDetector
 from agents.oracle import priced_schedule
 from agents.schedules import Scheduler, Scripted
+from agents.supervised import OBJECTIVES, ValueTraining
 from agents.value_network import ValueNetwork
 from agents.value_policy import TriggerValue
-from agents.value_training import OBJECTIVES, ValueTraining, evaluate, oracle_curve, plan, play_out, train
+from agents.value_training import evaluate, oracle_curve, plan, play_out, train
 from nl_env.depth.extrapolators import make_extrapolator
 from nl_env.evaluation import play
 from nl_env.statistics import slice_statistics

@@ -16,8 +16,8 @@ from agents.pictures import MAGNITUDES, picture, with_memory
 from agents.rl_networks import TriggerNetwork
 from agents.rules import Evenly, Periodic
 from nl_env.batched_ledger import BatchedLedger
+from nl_env.curves import OperatingPoints, oracle_points
 from nl_env.evaluation import DECIDING_METRIC
-from nl_env.frontier import OperatingPoints, oracle_points
 from nl_env.observations import IMAGE_OFFSET, cost_coordinate, state_vector, statistics_observation
 from nl_env.statistics import ActivityMemory
 from nl_env.traces import SequenceTrace
