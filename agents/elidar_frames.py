@@ -18,7 +18,8 @@ from agents.keyframe_networks import CAUSES
 from nl_env.config import number
 from nl_env.depth.elidar_pairs import held_out as held_out_names
 from nl_env.elidar import ElidarFiles, parse_sequence_name, read_sequence_list
-from nl_env.elidar.slicing import EventFrames, RawSequence, SlicingData
+from nl_env.elidar.metadata import warn_of
+from nl_env.elidar.slicing import EventFrames, RawSequence, SlicingData, readable_sequences
 
 BLOCKS = 10
 """Held-out frames are this many runs of neighbours, evenly spread: neighbours may be of one sequence."""
@@ -161,12 +162,15 @@ class ElidarSequences:
         return np.arange(start + 1, start + PIECE + 1) % 5 == 0
 
 
-def open_elidar_sequences(files: ElidarFiles, held_out: float) -> tuple[ElidarSequences, ElidarSequences]:
+def open_elidar_sequences(
+    files: ElidarFiles, held_out: float, on_error: str = "raise"
+) -> tuple[ElidarSequences, ElidarSequences]:
     """Training sequences and held-out ones of the slicing release's training list; others are left alone.
 
     Args:
         files: of the release.
         held_out: share of the sequences that choose the best weights and the thresholds.
+        on_error: ``"skip"`` leaves out sequences that cannot be opened and warns of each.
 
     Raises:
         FileNotFoundError: no list, or none of its sequences.
@@ -180,6 +184,8 @@ def open_elidar_sequences(files: ElidarFiles, held_out: float) -> tuple[ElidarSe
             f"{files.folder}: found no raw training sequences, expected train_sequences.txt and their .npz: "
             "a detector with a memory learns from whole sequences"
         )
-    chosen = held_out_names(names, held_out)
-    kept = [name for name in names if name not in chosen]
+    readable, problems = readable_sequences({name: files.raw[name] for name in names}, on_error=on_error)
+    warn_of(problems)
+    chosen = held_out_names(list(readable), held_out)
+    kept = [name for name in readable if name not in chosen]
     return ElidarSequences([files.raw[n] for n in kept]), ElidarSequences([files.raw[n] for n in chosen])

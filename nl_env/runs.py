@@ -126,6 +126,7 @@ def run_sequences(
     workers: int = 0,
     suffix: str = ".npz",
     progress: Callable[[int], None] = lambda finished: None,
+    broken: Callable[[int, ValueError], None] | None = None,
 ) -> list[Result]:
     """Run ``task`` on every seed that has no checkpoint yet and return all results in the order of ``seeds``.
 
@@ -139,9 +140,11 @@ def run_sequences(
         workers: spawned processes of one thread each; 0 runs in this process.
         suffix: of the checkpoints, ``<seed><suffix>``.
         progress: called with the number of newly finished sequences.
+        broken: called where ``task`` finds damaged data (a ``ValueError``); the seed has no result then, and
+            is tried again when the run is resumed. None raises the error.
 
     Raises:
-        ValueError: a negative number of workers.
+        ValueError: a negative number of workers, or what ``task`` raises.
     """
     if workers < 0:
         raise ValueError(f"workers: found {workers}, expected 0 or more")
@@ -151,26 +154,36 @@ def run_sequences(
     finished = _in_processes(task, missing, workers) if workers else _in_this_process(task, missing)
     try:
         for seed, result in finished:
-            with replacing(files[seed]) as temporary:
-                result.save(temporary)
+            if isinstance(result, ValueError):
+                if broken is None:
+                    raise result
+                broken(seed, result)
+                del files[seed]
+            else:
+                with replacing(files[seed]) as temporary:
+                    result.save(temporary)
             progress(1)
     except BaseException:
         finished.close()  # ends the workers
         remove_temporaries(checkpoints)
         raise
-    return [load(files[seed]) for seed in seeds]
+    return [load(file) for file in files.values()]
 
 
 def _in_this_process(
     task: Callable[[int], Result], seeds: Sequence[int]
-) -> Generator[tuple[int, Result], None, None]:
+) -> Generator[tuple[int, Result | ValueError], None, None]:
     for seed in seeds:
-        yield seed, task(seed)
+        try:
+            result: Result | ValueError = task(seed)
+        except ValueError as error:
+            result = error
+        yield seed, result
 
 
 def _in_processes(
     task: Callable[[int], Result], seeds: Sequence[int], workers: int
-) -> Generator[tuple[int, Result], None, None]:
+) -> Generator[tuple[int, Result | ValueError], None, None]:
     """Yield ``(seed, task(seed))`` as spawned workers finish; an interrupt ends them at once."""
     with _one_thread_each():
         pool = ProcessPoolExecutor(
@@ -182,7 +195,8 @@ def _in_processes(
         try:
             futures = {pool.submit(task, seed): seed for seed in seeds}
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                error = future.exception()
+                yield futures[future], error if isinstance(error, ValueError) else future.result()
         except BaseException:
             children = set(multiprocessing.active_children()) - others
             for child in children:

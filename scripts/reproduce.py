@@ -78,6 +78,8 @@ class Common:
     """ELiDAR only: range, m; 9 indoors."""
     sequences: int | None = None
     """Measure on the first ones only; all of them by default."""
+    on_error: str = "raise"
+    """raise, or skip: damaged sequences are left out, with a warning for each; the results name them."""
     seed: int = 0
     """Draws the bootstrap."""
     workers: int = os.cpu_count() or 1
@@ -95,7 +97,7 @@ class Common:
         """ELiDAR, where ``folder`` (default: the data) holds it."""
         number("fov", self.fov, 20.0, 120.0)
         files = elidar_in(folder or self.data)
-        return None if files is None else Release(files, self.fov, self.max_depth)
+        return None if files is None else Release(files, self.fov, self.max_depth, self.on_error)
 
     def test(self) -> Sequences:
         """The test recordings; those of another split raise ``ValueError``."""
@@ -109,7 +111,7 @@ class Common:
     ) -> Job:
         """Start a table; arguments as :class:`nl_env.reproduction.job.Job`."""
         folder = self.out or Path("runs") / table
-        output = Output(folder, self.markdown, self.workers, self.overwrite, self.resume)
+        output = Output(folder, self.markdown, self.workers, self.overwrite, self.resume, self.on_error)
         return Job(table, output, data, weights, settings)
 
 

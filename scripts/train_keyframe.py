@@ -87,6 +87,8 @@ class Options:
     """Recordings that choose the best weights and the thresholds. Of ELiDAR, frames are held out instead."""
     held_out: float = 0.1
     """ELiDAR only: share of the training frames or sequences that is held out."""
+    on_error: str = "raise"
+    """ELiDAR only: raise, or skip: raw sequences that cannot be opened are left out, each with a warning."""
     first_half: Path = TEMPORAL_WEIGHTS
     """ELiDAR only: a detector with a memory whose first half is kept, as ELiDAR has no maps of actors."""
     workers: int = 1
@@ -178,7 +180,7 @@ def data_of(options: Options) -> tuple[FrameSource, FrameSource]:
     if files is None:
         return slices_of(options.data, options.workers), slices_of(options.validation, options.workers)
     if options.architecture == TEMPORAL:
-        return open_elidar_sequences(files, options.held_out)
+        return open_elidar_sequences(files, options.held_out, options.on_error)
     return open_elidar_frames(files.require_slicing(), options.held_out)
 
 

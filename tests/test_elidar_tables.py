@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import h5py
 import numpy as np
 import pytest
 from elidar_files import Source, export
@@ -162,6 +163,82 @@ def test_sequences_that_either_release_trains_on_are_left_out(data, detectors, t
     arguments = ["table-end-to-end", "--data", str(copy), "--weights", "None", "--paper-weights", "None"]
     assert reproduce.main([*arguments, "--out", str(tmp_path / "no")]) == 2
     assert "found no raw sequences" in capsys.readouterr().err
+
+
+def truncate(data):
+    """Cut the raw sequence off: it cannot be opened."""
+    file = data / RAW_FOLDER / "Town03_Opt_05.npz"
+    file.write_bytes(file.read_bytes()[:-100])
+    return "Town03_Opt_05.npz: not a readable .npz"
+
+
+def flip_event_frames(data):
+    """Damage what is found when event frames are read, after opening."""
+    file = data / RAW_FOLDER / "Town03_Opt_05.npz"
+    content = bytearray(file.read_bytes())
+    for place in range(200, 1000):
+        content[place] ^= 0xFF
+    file.write_bytes(content)
+    return "Town03_Opt_05.npz: frames"
+
+
+def flip_depth(data):
+    """Damage a compressed chunk of depth, which is found when it is read."""
+    with h5py.File(data / PAIRS_FILE, "r") as file:
+        frames = file["Town03_Opt_05/depth_frames"]
+        places = [frames.id.get_chunk_info(k) for k in range(frames.id.get_num_chunks())]
+    with open(data / PAIRS_FILE, "r+b") as file:
+        for chunk in places:
+            file.seek(chunk.byte_offset + chunk.size // 3)
+            file.write(b"\xff" * 8)
+    return "Town03_Opt_05/depth_frames"
+
+
+@pytest.mark.parametrize(
+    ("table", "damage"),
+    [
+        ("table-keyframe", truncate),
+        ("table-keyframe", flip_event_frames),
+        ("table-rates", flip_depth),
+        ("table-end-to-end", truncate),
+        ("table-end-to-end", flip_depth),
+    ],
+)
+def test_a_damaged_sequence_is_left_out_when_asked_and_named(
+    data, detectors, tmp_path, capsys, table, damage
+):
+    shutil.copytree(data, tmp_path / "data")
+    told = damage(tmp_path / "data")
+    options = [table, "--data", str(tmp_path / "data"), "--workers", "0", "--out", str(tmp_path / "out")]
+    if table == "table-keyframe":
+        options += ["--weights", detectors[0], "--temporal-weights"]
+    elif table == "table-rates":
+        options += ["--weights", "--paper-weights", "--pairs", "2"]
+    else:
+        options += ["--weights", "None", "--keyframe-weights", detectors[0]]
+        options += ["--temporal-weights", detectors[1]]
+    assert reproduce.main(options) == 2
+    assert told in capsys.readouterr().err
+    with pytest.warns(UserWarning, match="left out") as warned:
+        assert reproduce.main([*options, "--on-error", "skip", "--overwrite"]) == 0
+    assert any(told in str(warning.message) for warning in warned)
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "1 test sequences (release ELiDAR" in text
+    (left_out,) = json.loads((tmp_path / "out" / "results.json").read_text())["left_out"]
+    assert told in left_out and f"Left out: {left_out}." in text
+
+
+def test_when_nothing_is_left_the_reasons_are_given(data, tmp_path, capsys):
+    shutil.copytree(data, tmp_path / "data")
+    with h5py.File(tmp_path / "data" / PAIRS_FILE, "r+") as file:
+        for name in TEST:
+            file[f"{name}/depth_frames"][...] = -1.0
+    options = ["table-rates", "--data", str(tmp_path / "data"), "--workers", "0", "--weights"]
+    options += ["--out", str(tmp_path / "out"), "--on-error", "skip"]
+    with pytest.warns(UserWarning, match="left out"):
+        assert reproduce.main(options) == 2
+    told = capsys.readouterr().err
+    assert "found no sequence that can be read" in told and all(name in told for name in TEST)
 
 
 def test_half_of_a_release_is_refused(data, tmp_path, capsys):

@@ -23,7 +23,7 @@ from nl_env.depth.paper_training import PaperTask
 from nl_env.depth.training import MotionMix, RefineTask
 from nl_env.depth.unet import load_unet
 from nl_env.elidar import ExtrapolationData, SlicingData, elidar_in, find_files, previous_frame
-from nl_env.elidar.layout import SLICING_FILE
+from nl_env.elidar.layout import RAW_FOLDER, SLICING_FILE
 from nl_env.weight_files import Card, write_weights
 from scripts import train_extrapolator, train_keyframe
 
@@ -260,6 +260,21 @@ def test_whole_sequences_are_followed_in_pieces(data, monkeypatch):
     monkeypatch.setattr(elidar_frames, "PIECE", 60)
     with pytest.raises(ValueError, match=r"npz: found 59 slices, expected at least 60"):
         open_elidar_sequences(find_files(data), 0.1)
+
+
+def test_a_broken_raw_sequence_can_be_left_out_and_is_named(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(elidar_frames, "PIECE", 20)
+    copy = tmp_path / "data"
+    shutil.copytree(data, copy)
+    broken = copy / RAW_FOLDER / "Town09_Opt_00.npz"
+    broken.write_bytes((copy / RAW_FOLDER / "Town01_Opt_00.npz").read_bytes()[:-100])
+    with open(copy / "slicing" / "train_sequences.txt", "a") as names:
+        names.write("Town09_Opt_00\n")
+    with pytest.raises(ValueError, match=r"Town09_Opt_00.npz: not a readable .npz"):
+        open_elidar_sequences(find_files(copy), 0.1)
+    with pytest.warns(UserWarning, match=r"left out Town09_Opt_00: .*not a readable .npz"):
+        training, validation = open_elidar_sequences(find_files(copy), 0.1, "skip")
+    assert (training.names, validation.names) == (["Town01_Opt_00"], ["Town02_Opt_ClearNoon"])
 
 
 def test_a_detector_with_a_memory_keeps_its_first_half(data, tmp_path, monkeypatch, capsys):

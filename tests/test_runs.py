@@ -22,13 +22,16 @@ class Square:
 
 @dataclass
 class Squares:
-    """A picklable task that can be told to stop at a seed."""
+    """A picklable task that can be told to stop at a seed, or to find damaged data."""
 
     stop_at: int = -1
+    broken: int = -1
 
     def __call__(self, seed):
         if seed == self.stop_at:
             raise KeyboardInterrupt
+        if seed == self.broken:
+            raise ValueError(f"sequence {seed}: damaged")
         return Square(seed**2)
 
 
@@ -62,6 +65,21 @@ def test_an_interrupted_run_keeps_what_is_finished_and_goes_on(tmp_path):
     found = run_sequences(Squares(stop_at=1), Square.load, [1, 2, 3], folder, progress=counted.append)
     assert [square.value for square in found] == [1, 4, 9]  # 1 would stop if it ran again
     assert counted == [1, 1, 1]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_damaged_data_stops_a_run_unless_it_is_left_out_and_is_tried_again(tmp_path, workers):
+    folder = open_folder(tmp_path / "run", SETTINGS)
+    task, seeds, told = Squares(broken=2), [1, 2, 3], []
+    with pytest.raises(ValueError, match="sequence 2: damaged"):
+        run_sequences(task, Square.load, seeds, folder, workers=workers)
+    found = run_sequences(
+        task, Square.load, seeds, folder, workers=workers, broken=lambda *what: told.append(what)
+    )
+    assert [square.value for square in found] == [1, 9]
+    assert [(seed, str(error)) for seed, error in told] == [(2, "sequence 2: damaged")]
+    mended = run_sequences(Squares(), Square.load, seeds, folder, workers=workers)
+    assert [square.value for square in mended] == [1, 4, 9]
 
 
 def test_a_folder_with_another_run_is_refused(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from nl_env.config import choice
 from nl_env.elidar.hdf5 import Hdf5Reader
 from nl_env.elidar.layout import RAW_ARRAYS, SPLITS
+from nl_env.elidar.metadata import ON_ERROR, Problem
 from nl_env.keyframes import DISTANCE_LIMIT, SPEED_LIMIT
 
 INT16 = np.iinfo(np.int16)
@@ -247,6 +248,34 @@ class RawSequence:
                 f"{self.path}: {name}[{k}]: found {values[k]}, expected a number in [{low}, {high}]"
             )
         return values
+
+
+def readable_sequences(
+    files: Mapping[str, Path], *, on_error: str = "raise"
+) -> tuple[dict[str, Path], tuple[Problem, ...]]:
+    """The raw sequences that can be opened, and the others.
+
+    Event frames are not read: damage in them is found when they are.
+
+    Args:
+        files: of each sequence.
+        on_error: ``"skip"`` leaves out what :class:`RawSequence` refuses.
+
+    Raises:
+        FileNotFoundError, ValueError: as :class:`RawSequence`, with ``on_error="raise"``.
+    """
+    choice("on_error", on_error, ON_ERROR)
+    readable, problems = {}, []
+    for name, path in files.items():
+        try:
+            RawSequence(path).close()
+        except (FileNotFoundError, ValueError) as error:
+            if on_error == "raise":
+                raise
+            problems.append(Problem(name, str(error)))
+        else:
+            readable[name] = path
+    return readable, tuple(problems)
 
 
 def _npy_header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:

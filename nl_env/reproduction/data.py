@@ -21,12 +21,14 @@ class Sequences:
         files: of each sequence seed.
         digest: SHA-256 over what identifies the files.
         settings: how they were recorded.
+        left_out: why others cannot be used.
     """
 
     split: str
     files: Mapping[int, Path]
     digest: str
     settings: Mapping[str, Any]
+    left_out: tuple[str, ...] = ()
 
 
 def find_sequences(folder: Path, most: int | None = None) -> Sequences:

@@ -26,7 +26,9 @@ from nl_env.elidar import (
     read_sequence_list,
 )
 from nl_env.elidar.layout import SPLITS, SequenceName
+from nl_env.elidar.metadata import warn_of
 from nl_env.elidar.plan import RELEASED_SPELLING
+from nl_env.elidar.slicing import readable_sequences
 from nl_env.replay import INDOOR_MIN_DEPTH, INDOOR_RANGE, OUTDOOR_MIN_DEPTH
 from nl_env.reproduction.data import Sequences
 from nl_env.reproduction.gaps import GROUPS, PAIRS_STREAM, Method, SequenceErrors, finite_mean
@@ -54,16 +56,27 @@ class Release:
         files: what there is.
         fov: horizontal field of view, degrees, which the files do not say.
         max_depth: range, m.
+        on_error: ``"skip"`` leaves out sequences that do not fit or cannot be opened, and warns of each.
     """
 
     files: ElidarFiles
     fov: float
     max_depth: float
+    on_error: str = "raise"
 
     def pairs(self, names: Sequence[str] | None = None) -> ExtrapolationData:
         """The test pairs, of all sequences or of some."""
         hdf5, metadata = self.files.require_pairs()
-        return ExtrapolationData(hdf5, metadata, split="test", sequences=names, max_depth=self.max_depth)
+        data = ExtrapolationData(
+            hdf5,
+            metadata,
+            split="test",
+            sequences=names,
+            max_depth=self.max_depth,
+            on_error=self.on_error,
+        )
+        warn_of(data.problems)
+        return data
 
     def test_pairs(
         self, most: int | None, names: Sequence[str] | None = None
@@ -73,7 +86,8 @@ class Release:
         chosen = tuple(first(list(data.sequences), most))
         identity = [_sha256(data.metadata), data.path.stat().st_size, chosen, self.fov, self.max_depth]
         files = dict.fromkeys(range(len(chosen)), data.path)
-        return Sequences("test", files, _digest(identity), _settings(data.shape)), chosen
+        left_out = tuple(problem.message for problem in data.problems)
+        return Sequences("test", files, _digest(identity), _settings(data.shape), left_out), chosen
 
     def labelled(self, split: str, most: int | None) -> Sequences:
         """The labelled event frames of a split.
@@ -85,7 +99,10 @@ class Release:
             FileNotFoundError: neither is there.
             ValueError: a file that cannot be used.
         """
-        raw = self.raw(split)
+        raw, problems = readable_sequences(self.raw(split), on_error=self.on_error)
+        warn_of(problems)
+        if problems and not raw:
+            raise ValueError(f"{self.files.folder}: found no usable {split} sequence: {problems[0].message}")
         if not raw:
             hdf5 = self.files.require_slicing()
             shape = SlicingData(hdf5, split).shape
@@ -98,9 +115,9 @@ class Release:
         numbers = {name: number for number, name in enumerate(sorted(self.files.raw))}
         files = {numbers[name]: raw[name] for name in first(sorted(raw), most)}
         identity = [[path.name, path.stat().st_size] for path in files.values()]
-        return Sequences(
-            split, files, _digest(identity), _settings(RawSequence(next(iter(files.values()))).shape)
-        )
+        settings = _settings(RawSequence(next(iter(files.values()))).shape)
+        left_out = tuple(problem.message for problem in problems)
+        return Sequences(split, files, _digest(identity), settings, left_out)
 
     def raw(self, split: str) -> dict[str, Path]:
         """The raw sequences of a split that the slicing release's list names."""

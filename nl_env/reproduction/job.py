@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import nl_env
+from nl_env.config import choice
+from nl_env.elidar.metadata import ON_ERROR
 from nl_env.reproduction.data import Sequences
 from nl_env.reproduction.document import (
     Section,
@@ -33,6 +36,10 @@ class Output:
         workers: processes of one thread each; 0 runs in this one.
         overwrite: replace the run that is in the folder.
         resume: continue it; data, weights and settings must be the same.
+        on_error: ``"skip"`` leaves out sequences that turn out to be damaged, and says so in the results.
+
+    Raises:
+        ValueError: an unknown ``on_error``.
     """
 
     folder: Path
@@ -40,6 +47,10 @@ class Output:
     workers: int = 0
     overwrite: bool = False
     resume: bool = False
+    on_error: str = "raise"
+
+    def __post_init__(self) -> None:
+        choice("on_error", self.on_error, ON_ERROR)
 
 
 class Job:
@@ -68,6 +79,7 @@ class Job:
         self.table = table
         self.output = output
         self.data = data
+        self.left_out: dict[int, str] = {}
         self.settings = {
             "version": nl_env.__version__,
             "table": table,
@@ -96,24 +108,55 @@ class Job:
     ) -> dict[str, list[Any]]:
         """Run ``task`` on every sequence that is not finished; all results, by part of the data.
 
-        Errors as ``nl_env.runs.open_folder``.
+        Raises:
+            ValueError: damaged data, unless ``on_error="skip"``; then, a part of which nothing is left.
+            OSError, ValueError: as ``nl_env.runs.open_folder``.
         """
         output = self.output
         folder = open_folder(output.folder, self.settings, overwrite=output.overwrite, resume=output.resume)
-        results = run_sequences(task, load, self.seeds, folder, workers=output.workers, progress=progress)
+        results = run_sequences(
+            task,
+            load,
+            self.seeds,
+            folder,
+            workers=output.workers,
+            progress=progress,
+            broken=self._leave_out if output.on_error == "skip" else None,
+        )
         by_seed = {result.seed: result for result in results}
-        return {name: [by_seed[seed] for seed in found.files] for name, found in self.data.items()}
+        parts = {
+            name: [by_seed[seed] for seed in found.files if seed in by_seed]
+            for name, found in self.data.items()
+        }
+        for name, part in parts.items():
+            if not part:
+                reasons = "; ".join(self.left_out[seed] for seed in self.data[name].files)
+                raise ValueError(f"{name}: found no sequence that can be read ({reasons})")
+        return parts
+
+    def _leave_out(self, seed: int, error: ValueError) -> None:
+        self.left_out[seed] = str(error)
+        warnings.warn(f"left out: {error}", stacklevel=2)
 
     def publish(self, sections: Sequence[Section], figures: Any, command: str, notes: str) -> str:
         """Write ``results.json`` and ``table.md``, update the document; the text of the tables."""
         parts = "; ".join(
-            f"{len(found.files)} {found.split} sequences ("
+            f"{len(found.files.keys() - self.left_out.keys())} {found.split} sequences ("
             + ", ".join(f"{name} {value}" for name, value in found.settings.items())
             + ")"
             for found in self.data.values()
         )
-        head = f"```\n{command}\n```\n\n{parts}. {notes} Machine: {machine()}."
-        content = {"command": command, "machine": machine(), "settings": self.settings, "figures": figures}
+        reasons = [reason for found in self.data.values() for reason in found.left_out]
+        reasons += [self.left_out[seed] for seed in sorted(self.left_out)]
+        missing = f" Left out: {'; '.join(reasons)}." if reasons else ""
+        head = f"```\n{command}\n```\n\n{parts}.{missing} {notes} Machine: {machine()}."
+        content = {
+            "command": command,
+            "machine": machine(),
+            "settings": self.settings,
+            "left_out": reasons,
+            "figures": figures,
+        }
         text = json.dumps(jsonable(content), indent=1, allow_nan=False) + "\n"
         write_text(self.output.folder / "results.json", text)
         page = f"# {self.table}\n\n{head}\n\n{markdown(sections, '##')}\n"
