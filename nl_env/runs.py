@@ -14,8 +14,9 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 SETTINGS_FILE = "settings.json"
 """Marks a folder as the output of a run and holds everything that determines its results."""
@@ -29,6 +30,20 @@ class Checkpoint(Protocol):
     def save(self, path: Path) -> None:
         """Write everything to ``path``."""
         ...
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A result of plain values: its file is JSON, and a manifest can list it as it is."""
+
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what :meth:`save` wrote."""
+        return cls(**json.loads(path.read_text(encoding="utf-8")))
 
 
 Result = TypeVar("Result", bound=Checkpoint)

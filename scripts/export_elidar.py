@@ -26,7 +26,7 @@ from nl_env.elidar.export import ExportOptions, assemble, write_part
 from nl_env.elidar.layout import SHAPE, SPLITS
 from nl_env.elidar.plan import sequence_names, split_of_seed
 from nl_env.recording import Recording
-from nl_env.runs import open_folder, run_sequences, write_text
+from nl_env.runs import Entry, open_folder, run_sequences, write_text
 
 MANIFEST_FILE = "sequences.json"
 """Written last: which recording became which sequence. A folder without it is not finished."""
@@ -52,7 +52,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ExportedSequence(Entry):
     """One exported sequence, as the manifest lists it."""
 
     name: str
@@ -61,27 +61,18 @@ class Entry:
     recording: str
     description: dict[str, Any]
 
-    def save(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
-
-    @classmethod
-    def load(cls, path: Path) -> Entry:
-        """Read what :meth:`save` wrote."""
-        return cls(**json.loads(path.read_text(encoding="utf-8")))
-
 
 @dataclass(frozen=True)
 class ExportSequence:
     """The work of one process: turn one recording into its part."""
 
     files: dict[int, Path]
-    entries: dict[int, Entry]
+    entries: dict[int, ExportedSequence]
     options: ExportOptions
     parts: Path
     data_folder: Path
 
-    def __call__(self, seed: int) -> Entry:
+    def __call__(self, seed: int) -> ExportedSequence:
         """Write the part ``SEED.h5``."""
         entry = self.entries[seed]
         with Recording(self.files[seed]) as recording:
@@ -103,7 +94,9 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def describe_recordings(paths: Sequence[Path], keep_resolution: bool) -> tuple[dict[int, Path], list[Entry]]:
+def describe_recordings(
+    paths: Sequence[Path], keep_resolution: bool
+) -> tuple[dict[int, Path], list[ExportedSequence]]:
     """Files by seed, and what each becomes.
 
     Raises:
@@ -129,7 +122,7 @@ def describe_recordings(paths: Sequence[Path], keep_resolution: bool) -> tuple[d
             )
     names = sequence_names(descriptions)
     entries = [
-        Entry(name, split_of_seed(seed), seed, path.name, description)
+        ExportedSequence(name, split_of_seed(seed), seed, path.name, description)
         for name, (seed, path), description in zip(names, files.items(), descriptions, strict=True)
     ]
     return files, entries
@@ -155,7 +148,7 @@ def run(options: Options) -> list[dict[str, Any]]:
     with tqdm(total=len(entries), desc="sequences", unit="sequence", disable=None) as bar:
         run_sequences(
             ExportSequence(files, by_seed, options.export, parts, options.out),
-            Entry.load,
+            ExportedSequence.load,
             list(files),
             parts,
             workers=options.workers,

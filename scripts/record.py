@@ -34,7 +34,7 @@ from nl_env.config import (
 )
 from nl_env.recording import Recording, record_sequence
 from nl_env.recording.schema import DEPTH_PERIODS_US, VERSION
-from nl_env.runs import open_folder, run_sequences, write_text
+from nl_env.runs import Entry, open_folder, run_sequences, write_text
 
 MANIFEST_FILE = "manifest.json"
 """Written last: a folder without it is not finished."""
@@ -99,7 +99,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Entry:
+class RecordedSequence(Entry):
     """One finished recording, as the manifest lists it."""
 
     seed: int
@@ -110,15 +110,6 @@ class Entry:
     events: int
     description: dict[str, Any]
 
-    def save(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
-
-    @classmethod
-    def load(cls, path: Path) -> Entry:
-        """Read what :meth:`save` wrote."""
-        return cls(**json.loads(path.read_text(encoding="utf-8")))
-
 
 @dataclass(frozen=True)
 class RecordSequence:
@@ -127,14 +118,14 @@ class RecordSequence:
     settings: Settings
     folder: Path
 
-    def __call__(self, seed: int) -> Entry:
+    def __call__(self, seed: int) -> RecordedSequence:
         """Write ``SEED.h5``."""
         settings, path = self.settings, self.folder / f"{seed}.h5"
         record_sequence(
             path, settings.config, seed, 1000 * settings.depth_period_ms, intensity=settings.intensity
         )
         with Recording(path) as recording:
-            return Entry(
+            return RecordedSequence(
                 seed=seed,
                 file=f"{self.folder.name}/{path.name}",
                 bytes=path.stat().st_size,
@@ -168,7 +159,7 @@ def drop_lost(folder: Path) -> None:
     """Forget the finished sequences whose recording was removed or cut short, so that they are redone."""
     for path in folder.glob("*.json"):
         recording = path.with_suffix(".h5")
-        if not recording.exists() or recording.stat().st_size != Entry.load(path).bytes:
+        if not recording.exists() or recording.stat().st_size != RecordedSequence.load(path).bytes:
             path.unlink()
 
 
@@ -188,7 +179,7 @@ def run(options: Options) -> dict[str, Any]:
     with tqdm(total=options.sequences, desc="sequences", unit="sequence", disable=None) as bar:
         entries = run_sequences(
             RecordSequence(settings, folder),
-            Entry.load,
+            RecordedSequence.load,
             seeds,
             folder,
             workers=options.workers,
