@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, TypeVar
 
 SETTINGS_FILE = "settings.json"
 """Marks a folder as the output of a run and holds everything that determines its results."""
@@ -41,12 +41,13 @@ class Entry:
         path.write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls: type[EntryType], path: Path) -> EntryType:
         """Read what :meth:`save` wrote."""
         return cls(**json.loads(path.read_text(encoding="utf-8")))
 
 
 Result = TypeVar("Result", bound=Checkpoint)
+EntryType = TypeVar("EntryType", bound=Entry)
 
 
 @contextmanager
