@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from nl_env.types import Camera, EgoState
@@ -72,17 +73,30 @@ def visible(
     Returns:
         ``(n,)`` bool.
     """
-    seen = np.zeros(len(centres), dtype=bool)
-    x, y, z = ((centres[:, :3] - pose[:3, 3]) @ pose[:3, :3]).T
-    near = np.flatnonzero((z > NEAR_PLANE) & (z < VIEW_RANGE))
-    column = np.rint(camera.fx * x[near] / z[near] + camera.cx).astype(np.int64)
-    row = np.rint(camera.fy * y[near] / z[near] + camera.cy).astype(np.int64)
-    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    near, column, row = near[inside], column[inside], row[inside]
-    surface = depth[row, column]
-    own_extent = HALF_HEIGHTS_DEEP * centres[near, 3]
-    seen[near] = (surface == 0) | (surface >= z[near] - own_extent)
+    seen = np.zeros(len(centres), dtype=np.bool_)
+    _mark_visible(
+        (centres[:, :3] - pose[:3, 3]) @ pose[:3, :3],
+        centres[:, 3],
+        depth,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        seen,
+    )
     return seen
+
+
+@njit(cache=True, error_model="numpy")
+def _mark_visible(points, half_heights, depth, intrinsics, seen):  # type: ignore[no-untyped-def]
+    """:func:`visible` of ``(n, 3)`` points in the camera's frame."""
+    fx, fy, cx, cy = intrinsics
+    height, width = depth.shape
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        if not NEAR_PLANE < z < VIEW_RANGE:
+            continue
+        column, row = np.rint(fx * x / z + cx), np.rint(fy * y / z + cy)
+        if 0 <= column < width and 0 <= row < height:
+            surface = depth[int(row), int(column)]
+            seen[k] = surface == 0 or surface >= z - HALF_HEIGHTS_DEEP * half_heights[k]
 
 
 class NewActorDetector:

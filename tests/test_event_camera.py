@@ -189,6 +189,19 @@ def test_binned_and_listed_events_agree_and_leave_the_same_state(preset, seed, t
         np.testing.assert_array_equal(summed.sum(0), event_frame(events, shape, start, start + 20_000))
 
 
+def test_thresholds_stay_a_window_apart_through_time_bases_where_nothing_happens():
+    shape = (20, 40)  # more than one chunk, the last one not full
+    cam = EventCamera(EventCameraConfig(leak_rate_hz=100.0, threshold_on=0.5, cutoff_hz=0.0), shape)
+    image = np.full(shape, 0.3, np.float32)
+    cam.reset(image, 0, np.random.default_rng(0))
+    count = sum(len(cam.events(image, 400 * k)) for k in range(1, 401))
+    assert count == pytest.approx(0.16 * 100.0 * image.size, rel=0.1)
+    pixels = cam._pixels
+    window = pixels.on_step + pixels.off_step
+    np.testing.assert_allclose(pixels.on_at - pixels.off_at, window, atol=1e-6)
+    assert cam._base > 0
+
+
 def test_same_seed_same_events_reset_redraws_and_a_pickled_camera_continues():
     images = textures((20, 30), 6, 0)
 

@@ -3,18 +3,26 @@
 import numpy as np
 from numba import njit
 
-from nl_env.scene.lanes import (
+from nl_env.lanes import (
     EXACT,
     LANES,
+    first_of,
+    flags,
+    from_bits,
     fused,
     gather,
+    how_many,
     leading,
     load,
+    load_some,
     quotient,
     ramp,
     row_of,
+    shifted_down,
     splat,
     store,
+    store_some,
+    to_bits,
     to_float,
     to_int,
     where,
@@ -53,6 +61,34 @@ def whole_numbers(values, out):
 @njit(**OPTIONS)
 def count_leading(values, label):
     return leading(load(row_of(values, 0), 0) == splat(label))
+
+
+@njit(**OPTIONS)
+def add_to_some(values, count, otherwise, out):
+    some = first_of(count)
+    read = load_some(row_of(values, 0), 0, some, splat(otherwise))
+    store(row_of(out, 0), 0, read)
+    store_some(row_of(out, 1), 0, some, read + splat(np.float32(1)))
+
+
+@njit(**OPTIONS)
+def look_up_floats(table, places, count, out):
+    store(row_of(out, 0), 0, gather(row_of(table, 0), load(row_of(places, 0), 0), first_of(count)))
+
+
+@njit(**OPTIONS)
+def between(values, low, high):
+    row = load(row_of(values, 0), 0)
+    inside = (row >= splat(low)) & (row <= splat(high))
+    outside = (row < splat(low)) | (row > splat(high))
+    return flags(inside), flags(outside), how_many(inside)
+
+
+@njit(**OPTIONS)
+def take_apart(values, out):
+    bits = to_bits(load(row_of(values, 0), 0))
+    store(row_of(out, 0), 0, from_bits(bits + splat(1)))
+    store(row_of(out, 1), 0, to_float(shifted_down(bits - splat(0x3F800000), splat(23))))
 
 
 def random_row(rng, low, high):
@@ -114,3 +150,32 @@ def test_a_caller_with_fast_math_does_not_loosen_a_division():
     values, out = random_row(np.random.default_rng(3), 0.001, 900.0), np.zeros((2, LANES), np.float32)
     fast(values, out)
     assert np.array_equal(out[0], np.float32(1) / values[0])
+
+
+def test_only_wanted_elements_are_read_and_written():
+    memory = np.arange(2 * LANES, dtype=np.float32)
+    for count in range(LANES + 1):
+        out = np.full((2, LANES), -1, np.float32)
+        add_to_some(memory[None], count, np.float32(7), out)
+        assert out[0].tolist() == [*range(count), *[7] * (LANES - count)]
+        assert out[1].tolist() == [*range(1, count + 1), *[-1] * (LANES - count)]
+
+
+def test_floats_are_looked_up():
+    places = np.array([[3, 1, 4, 1, 5, 2**30, -7, 2**30]], np.int32)
+    table, out = np.arange(10, 20, dtype=np.float32)[None] / 4, np.full((1, LANES), -1, np.float32)
+    look_up_floats(table, places, 5, out)
+    assert out.tolist() == [[3.25, 2.75, 3.5, 2.75, 3.75, 0, 0, 0]]
+
+
+def test_limits_belong_to_the_inside_and_nan_to_neither_side():
+    values = np.array([[1, 2, 3, 4, 5, np.nan, 2.5, 9]], np.float32)
+    inside, outside, count = between(values, np.float32(2), np.float32(4))
+    assert inside == 0b01001110 and outside == 0b10010001 and count == 4
+
+
+def test_bits_of_floats_and_a_shift_that_keeps_the_sign():
+    values, out = np.array([[1, 0.3, 2, 5, 0.01, 300, 1e-30, 0.5]], np.float32), np.zeros((2, 8), np.float32)
+    take_apart(values, out)
+    assert out[0].tolist() == np.nextafter(values[0], np.float32(np.inf)).tolist()
+    assert out[1].tolist() == np.floor(np.log2(values[0].astype(np.float64))).tolist()

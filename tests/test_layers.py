@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 
 LAYERS = (
     ("types",),
-    ("command_line", "config", "runs"),
+    ("command_line", "config", "lanes", "runs"),
     ("scene", "sensors", "representations", "keyframes", "statistics", "costs", "steps"),
     ("simulator",),
     ("recording", "weight_files"),

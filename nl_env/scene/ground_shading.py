@@ -6,9 +6,10 @@ import math
 
 from numba import njit
 
-from nl_env.scene.lanes import (
+from nl_env.lanes import (
     EXACT,
     LANES,
+    first_of,
     fused,
     gather,
     load,
@@ -20,7 +21,7 @@ from nl_env.scene.lanes import (
     to_int,
     where,
 )
-from nl_env.scene.raster import INLINE, ONE, ZERO, along, f4, first_of, i4
+from nl_env.scene.raster import INLINE, ONE, ZERO, along, f4, i4
 from nl_env.scene.texels import LONG_RUN, bilinear, floor, mip_level, repeating
 from nl_env.scene.textures import DETAIL, LEVELS, SIZE, UNIT
 

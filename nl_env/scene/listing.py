@@ -10,6 +10,7 @@ import math
 
 from numba import njit
 
+from nl_env.lanes import row_of
 from nl_env.scene.raster import (
     A0,
     ALBEDO,
@@ -22,13 +23,16 @@ from nl_env.scene.raster import (
     CONTRAST,
     DENSITY,
     DENSITY_PER_M,
-    EDGE,
     FAST,
     GREY,
     HAS_HOLES,
+    HIGH,
+    HIGH_SLOPE,
     HOLES,
     INLINE,
     LEFT,
+    LOW,
+    LOW_SLOPE,
     NEAR,
     NORMAL,
     REPEAT,
@@ -38,19 +42,17 @@ from nl_env.scene.raster import (
     SHIFT,
     SHIFT_U,
     SHIFT_V,
-    SIDE,
-    SLOPE,
     TEXTURE,
     TEXTURE_ID,
     TOP,
     TWO_SIDED,
+    UNBOUNDED,
     W0,
     WX,
     WY,
     ZERO,
     U,
     V,
-    u8,
 )
 from nl_env.scene.textures import SIZE, UNIT
 
@@ -84,37 +86,45 @@ def cull_objects(centre, radius, rotation, eye, lens, width, height, far, visibl
 @njit(**FAST)
 def list_quads(packed, visible, count, first, size, rotation, eye, lens, width, height, far, table, used):
     """Append the visible quads of ``count`` objects to the draw list; returns its length."""
+    axes = (
+        rotation[0, 0], rotation[0, 1], rotation[0, 2],
+        rotation[1, 0], rotation[1, 1], rotation[1, 2],
+        rotation[2, 0], rotation[2, 1], rotation[2, 2],
+    )  # fmt: skip
+    position = eye[0], eye[1], eye[2]
     for j in range(count):
         m = visible[j]
         for q in range(first[m], first[m] + size[m]):
-            if project(packed, u8(q), rotation, eye, lens, width, height, far, table, u8(used)):
+            if project(row_of(packed, q), axes, position, lens, width, height, far, row_of(table, used)):
                 used += 1
     return used
 
 
 @njit(**INLINE)
-def project(packed, q, rotation, eye, lens, width, height, far, table, r):
+def project(quad, axes, position, lens, width, height, far, row):
     """Write draw-list row ``r`` for quad ``q``; returns False when it cannot be seen."""
     fx, fy, cx, cy = lens
-    ex, ey, ez = packed[q, 0] - eye[0], packed[q, 1] - eye[1], packed[q, 2] - eye[2]
-    facing = packed[q, NORMAL] * ex + packed[q, NORMAL + 1] * ey + packed[q, NORMAL + 2] * ez
-    if facing >= 0.0 and packed[q, TWO_SIDED] == ZERO:
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = axes
+    eye = position
+    ex, ey, ez = quad[0] - eye[0], quad[1] - eye[1], quad[2] - eye[2]
+    facing = quad[NORMAL] * ex + quad[NORMAL + 1] * ey + quad[NORMAL + 2] * ez
+    if facing >= 0.0 and quad[TWO_SIDED] == ZERO:
         return False
-    ux, uy, uz = packed[q, U], packed[q, U + 1], packed[q, U + 2]
-    vx, vy, vz = packed[q, V], packed[q, V + 1], packed[q, V + 2]
-    o2 = rotation[0, 2] * ex + rotation[1, 2] * ey + rotation[2, 2] * ez
-    u2 = rotation[0, 2] * ux + rotation[1, 2] * uy + rotation[2, 2] * uz
-    v2 = rotation[0, 2] * vx + rotation[1, 2] * vy + rotation[2, 2] * vz
+    ux, uy, uz = quad[U], quad[U + 1], quad[U + 2]
+    vx, vy, vz = quad[V], quad[V + 1], quad[V + 2]
+    o2 = r02 * ex + r12 * ey + r22 * ez
+    u2 = r02 * ux + r12 * uy + r22 * uz
+    v2 = r02 * vx + r12 * vy + r22 * vz
     z1, z2, z3 = o2 + u2, o2 + v2, o2 + u2 + v2
     z_min = min(min(o2, z1), min(z2, z3))
     if max(max(o2, z1), max(z2, z3)) < NEAR or z_min > far:
         return False
-    o0 = rotation[0, 0] * ex + rotation[1, 0] * ey + rotation[2, 0] * ez
-    o1 = rotation[0, 1] * ex + rotation[1, 1] * ey + rotation[2, 1] * ez
-    u0 = rotation[0, 0] * ux + rotation[1, 0] * uy + rotation[2, 0] * uz
-    u1 = rotation[0, 1] * ux + rotation[1, 1] * uy + rotation[2, 1] * uz
-    v0 = rotation[0, 0] * vx + rotation[1, 0] * vy + rotation[2, 0] * vz
-    v1 = rotation[0, 1] * vx + rotation[1, 1] * vy + rotation[2, 1] * vz
+    o0 = r00 * ex + r10 * ey + r20 * ez
+    o1 = r01 * ex + r11 * ey + r21 * ez
+    u0 = r00 * ux + r10 * uy + r20 * uz
+    u1 = r01 * ux + r11 * uy + r21 * uz
+    v0 = r00 * vx + r10 * vy + r20 * vz
+    v1 = r01 * vx + r11 * vy + r21 * vz
     # The corners behind the camera have no image: there the edges alone bound the spans.
     top, bottom, left, right = 0.0, height - 1.0, 0.0, width - 1.0
     if z_min >= NEAR:
@@ -141,36 +151,37 @@ def project(packed, q, rotation, eye, lens, width, height, far, table, r):
     a2 = a2 * s - a0 * cx - a1 * cy
     b2 = b2 * s - b0 * cx - b1 * cy
     c2 = c2 * s - c0 * cx - c1 * cy
-    table[r, W0], table[r, WX], table[r, WY] = c2, c0, c1
-    table[r, A0], table[r, AX], table[r, AY] = a2, a0, a1
-    table[r, B0], table[r, BX], table[r, BY] = b2, b0, b1
-    _edge(table, r, u8(0), a2, a0, a1)
-    _edge(table, r, u8(1), c2 - a2, c0 - a0, c1 - a1)
-    _edge(table, r, u8(2), b2, b0, b1)
-    _edge(table, r, u8(3), c2 - b2, c0 - b0, c1 - b1)
-    table[r, TOP], table[r, BOTTOM], table[r, LEFT], table[r, RIGHT] = top, bottom, left, right
-    table[r, TEXTURE] = packed[q, TEXTURE_ID]
-    table[r, HOLES] = packed[q, HAS_HOLES]
-    table[r, REPEAT_U], table[r, REPEAT_V] = packed[q, REPEAT], packed[q, REPEAT + 1]
-    table[r, SHIFT_U], table[r, SHIFT_V] = packed[q, SHIFT], packed[q, SHIFT + 1]
-    density = SIZE * packed[q, DENSITY_PER_M]
-    table[r, DENSITY] = density
-    albedo = packed[q, ALBEDO]
+    row[W0], row[WX], row[WY] = c2, c0, c1
+    row[A0], row[AX], row[AY] = a2, a0, a1
+    row[B0], row[BX], row[BY] = b2, b0, b1
+    _edge(row, 0, a2, a0, a1)
+    _edge(row, 1, c2 - a2, c0 - a0, c1 - a1)
+    _edge(row, 2, b2, b0, b1)
+    _edge(row, 3, c2 - b2, c0 - b0, c1 - b1)
+    row[TOP], row[BOTTOM], row[LEFT], row[RIGHT] = top, bottom, left, right
+    row[TEXTURE] = quad[TEXTURE_ID]
+    row[HOLES] = quad[HAS_HOLES]
+    row[REPEAT_U], row[REPEAT_V] = quad[REPEAT], quad[REPEAT + 1]
+    row[SHIFT_U], row[SHIFT_V] = quad[SHIFT], quad[SHIFT + 1]
+    density = SIZE * quad[DENSITY_PER_M]
+    row[DENSITY] = density
+    albedo = quad[ALBEDO]
     contrast = 0.0
-    if packed[q, HAS_HOLES] != ZERO:
+    if quad[HAS_HOLES] != ZERO:
         # Beyond one texel per pixel the grain averages out; the holes stay, as a point-sampled depth needs.
         texels = density * 0.5 * (o2 + z3) / fx
         contrast = albedo / UNIT * min(1.0, 1.0 / max(texels, 1e-6))
-    table[r, CONTRAST] = contrast
-    table[r, GREY] = albedo - contrast * UNIT
+    row[CONTRAST] = contrast
+    row[GREY] = albedo - contrast * UNIT
     return True
 
 
 @njit(**INLINE)
-def _edge(table, r, e, p0, px, py):
+def _edge(row, e, p0, px, py):
     """Store the half-plane ``p0 + px x + py y >= 0`` as a bound on x."""
     px = 1e-20 if abs(px) < 1e-20 else px
     inverse = -1.0 / px
-    table[r, u8(EDGE) + e] = p0 * inverse
-    table[r, u8(SLOPE) + e] = py * inverse
-    table[r, u8(SIDE) + e] = px
+    edge, slope = p0 * inverse, py * inverse
+    inside_right = px > 0.0
+    row[LOW + e], row[LOW_SLOPE + e] = edge if inside_right else -UNBOUNDED, slope if inside_right else 0.0
+    row[HIGH + e], row[HIGH_SLOPE + e] = UNBOUNDED if inside_right else edge, 0.0 if inside_right else slope

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from nl_env.scene.lanes import (
+from nl_env.lanes import (
     EXACT,
     LANES,
+    first_of,
     fused,
     gather,
     load,
@@ -53,42 +54,36 @@ PACKED = 21
 
 # Columns of the draw list, one row per visible quad: planes of w, s w and t w over the pixel ...
 W0, WX, WY, A0, AX, AY, B0, BX, BY = range(9)
-# ... the four edges as x = EDGE + SLOPE y, and whether the inside is to the right ...
-EDGE, SLOPE, SIDE = 9, 13, 17
-TOP, BOTTOM, LEFT, RIGHT = 21, 22, 23, 24
+# ... the four edges: x is at least LOW + LOW_SLOPE y and at most HIGH + HIGH_SLOPE y, one of them far off ...
+LOW, LOW_SLOPE, HIGH, HIGH_SLOPE = 9, 13, 17, 21
+TOP, BOTTOM, LEFT, RIGHT = 25, 26, 27, 28
 # ... and the material.
-GREY, CONTRAST, TEXTURE, REPEAT_U, REPEAT_V, SHIFT_U, SHIFT_V, DENSITY, HOLES = range(25, 34)
-COLUMNS = 34
+GREY, CONTRAST, TEXTURE, REPEAT_U, REPEAT_V, SHIFT_U, SHIFT_V, DENSITY, HOLES = range(29, 38)
+COLUMNS = 38
+UNBOUNDED = 1e30
+"""Beyond every pixel."""
+
+
+@njit(**INLINE)
+def _four(table, r, column):
+    """A value of each edge of draw-list row ``r``."""
+    return table[r, column], table[r, column + 1], table[r, column + 2], table[r, column + 3]
 
 
 @njit(**INLINE)
 def _edges(table, r):
     """The bounds of draw-list row ``r`` as values, so that they stay in registers while rows are filled."""
-    return (
-        table[r, LEFT], table[r, RIGHT],
-        table[r, EDGE], table[r, SLOPE], table[r, SIDE],
-        table[r, EDGE + 1], table[r, SLOPE + 1], table[r, SIDE + 1],
-        table[r, EDGE + 2], table[r, SLOPE + 2], table[r, SIDE + 2],
-        table[r, EDGE + 3], table[r, SLOPE + 3], table[r, SIDE + 3],
-    )  # fmt: skip
-
-
-@njit(**INLINE)
-def _narrow(low, high, edge, slope, side, y):
-    """Cut the span at one edge."""
-    x = edge + slope * y
-    inside_right = side > 0.0
-    return max(low, x if inside_right else low), min(high, high if inside_right else x)
+    lows, highs = _four(table, r, LOW), _four(table, r, HIGH)
+    low_slopes, high_slopes = _four(table, r, LOW_SLOPE), _four(table, r, HIGH_SLOPE)
+    return table[r, LEFT], table[r, RIGHT], lows, low_slopes, highs, high_slopes
 
 
 @njit(**INLINE)
 def _span(edges, y):
     """First and last pixel of a quad on image row ``y``."""
-    low, high, e0, s0, d0, e1, s1, d1, e2, s2, d2, e3, s3, d3 = edges
-    low, high = _narrow(low, high, e0, s0, d0, y)
-    low, high = _narrow(low, high, e1, s1, d1, y)
-    low, high = _narrow(low, high, e2, s2, d2, y)
-    return _narrow(low, high, e3, s3, d3, y)
+    low, high, (l0, l1, l2, l3), (a0, a1, a2, a3), (h0, h1, h2, h3), (b0, b1, b2, b3) = edges
+    low = max(low, max(max(l0 + a0 * y, l1 + a1 * y), max(l2 + a2 * y, l3 + a3 * y)))
+    return low, min(high, min(min(h0 + b0 * y, h1 + b1 * y), min(h2 + b2 * y, h3 + b3 * y)))
 
 
 @njit(**FAST)
@@ -139,12 +134,6 @@ def _draw_opaque(x0, n, start, step, label, inverse_depth, index):
 def along(i, start, step):
     """``start + step (i + k)`` for the lanes ``k``."""
     return fused(splat(step), to_float(ramp() + splat(i)), splat(start))
-
-
-@njit(**EXACT)
-def first_of(count):
-    """The first ``count`` lanes."""
-    return ramp() < splat(count)
 
 
 @njit(**EXACT)

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from nl_env.lanes import LANES
 from nl_env.scene import listing, raster, shading
-from nl_env.scene.lanes import LANES
 from nl_env.scene.quads import Objects, Quads
 from nl_env.scene.raster import FAST
 from nl_env.scene.textures import Textures, halve, load, pack
@@ -109,10 +109,11 @@ class Buffers(NamedTuple):
 
 @njit(**FAST)
 def render_frame(
-    static, static_objects, moving, moving_objects, rotation, eye, lens, textures, ground, light, buffers,
-    intensity, depth, with_depth,
+    static, static_objects, moving, moving_objects, pose, lens, textures, ground, light, buffers, intensity,
+    depth, with_depth,
 ):  # fmt: skip
     """Render one frame into ``intensity`` and, when asked for, ``depth``."""
+    rotation, eye = pose[:3, :3].copy(), pose[:3, 3].copy()
     inverse_depth, index, shade, table = buffers.inverse_depth, buffers.indices, buffers.shade, buffers.table
     visible = buffers.visible
     fx, fy, cx, cy = lens
@@ -204,8 +205,7 @@ class Renderer:
             self._static,
             self._objects,
             *moving,
-            np.ascontiguousarray(pose[:3, :3]),
-            np.ascontiguousarray(pose[:3, 3]),
+            np.ascontiguousarray(pose),
             self._lens,
             self._textures,
             self._ground,

@@ -26,14 +26,15 @@ MIX = (
 _STYLES_OF = {"highway": ("rural", "suburb"), "merge": ("rural", "suburb"), "exit": ("rural",)}
 _TOWN_STYLES = ("downtown", "suburb", "park")
 _TWIST_STEP_US = 500
+_RADIANS = math.pi / 180
 
 
 @njit(**FAST)
-def _pose_actors(template, first, size, states, moving, centres):
-    """Turn every actor's packed quads from its own frame into the world."""
-    for m in range(states.shape[0]):
-        x, y = states[m, 0], states[m, 1]
-        cos, sin = math.cos(states[m, 2]), math.sin(states[m, 2])
+def _pose_actors(template, first, size, poses, moving, centres):
+    """Turn every actor's packed quads from its own frame into the world; ``poses`` are x, y and heading."""
+    for m in range(poses.shape[0]):
+        x, y = poses[m, 0], poses[m, 1]
+        cos, sin = math.cos(poses[m, 2]), math.sin(poses[m, 2])
         centres[0, m], centres[1, m] = x, y
         for q in range(first[m], first[m] + size[m]):
             for column in (ORIGIN, U, V, NORMAL):
@@ -84,7 +85,8 @@ class DrivingScene:
             (np.cumsum(sizes) - sizes).astype(np.int32),
             sizes,
         )
-        self._actors.centre[2] = [a.height / 2 for a in self.traffic.actors]
+        self._half_heights = np.array([actor.height / 2 for actor in self.traffic.actors]).reshape(-1)
+        self._actors.centre[2] = self._half_heights
         self._renderer = Renderer(
             camera, (built.quads, built.objects), built.ground, conditions.light(), len(self._template), count
         )
@@ -102,35 +104,24 @@ class DrivingScene:
             intensity: ``(H, W)`` float32, filled with gamma-coded grey in [0.001, 1].
             depth: ``(H, W)`` float32, filled with z-depth in metres, 0 where nothing is within 200 m.
         """
-        states = self.traffic.actor_states(t_us)
-        _pose_actors(
-            self._template, self._actors.first, self._actors.size, states, self._moving, self._actors.centre
-        )
-        self._renderer.render(self.pose(t_us), (self._moving, self._actors), intensity, depth)
+        pose = self.pose(t_us)
+        actors, poses = self._actors, self.traffic.actor_tracks.at(t_us)[0]
+        _pose_actors(self._template, actors.first, actors.size, poses, self._moving, actors.centre)
+        self._renderer.render(pose, (self._moving, actors), intensity, depth)
         self._rain.draw(t_us, intensity)
 
     def pose(self, t_us: int) -> NDArray[np.float64]:
         """``(4, 4)`` camera to world. The body pitches and rolls with the road and dives under braking."""
         ego = self.traffic.ego(t_us)
-        t = t_us * 1e-6
-        shake = self._config.vibration * min(1.0, ego.speed / 8.0)
-        a = self._phases
-        wave = lambda hz, i: math.sin(2 * math.pi * hz * t + a[i])  # noqa: E731
-        pitch = shake * (0.18 * wave(1.3, 0) + 0.08 * wave(3.1, 1) + 0.025 * wave(9.0, 2))
-        pitch -= 0.25 * self._config.vibration * min(max(ego.acceleration, -4.0), 4.0)
-        roll = shake * (0.15 * wave(0.9, 3) + 0.06 * wave(4.3, 4))
-        return camera_pose(
-            (ego.x, ego.y, self._config.camera_height + 0.015 * shake * wave(1.4, 5)),
-            ego.heading,
-            math.radians(pitch),
-            math.radians(roll),
-        )
+        config = self._config
+        motion = (ego.x, ego.y, ego.heading, ego.speed, ego.acceleration)
+        return _swaying_pose(motion, t_us * 1e-6, config.vibration, config.camera_height, self._phases)
 
     def twist(self, t_us: int) -> NDArray[np.float64]:
         """``(6,)`` camera-frame linear (m/s) and angular (rad/s) velocity, from poses 1 ms apart."""
+        rotation = self.pose(t_us)[:3, :3]  # first: the renderer has just asked for this instant, too
         before, after = self.pose(max(t_us - _TWIST_STEP_US, 0)), self.pose(t_us + _TWIST_STEP_US)
         dt = (t_us + _TWIST_STEP_US - max(t_us - _TWIST_STEP_US, 0)) * 1e-6
-        rotation = self.pose(t_us)[:3, :3]
         spin = before[:3, :3].T @ after[:3, :3] / dt
         linear = rotation.T @ (after[:3, 3] - before[:3, 3]) / dt
         # The antisymmetric part of R' dR/dt holds the angular velocity.
@@ -147,29 +138,54 @@ class DrivingScene:
 
     def actor_centres(self, t_us: int) -> NDArray[np.float64]:
         """``(n, 4)``: x, y, z of each moving actor's centre and half its height, m."""
-        states = self.traffic.actor_states(t_us)
-        half = np.array([actor.height / 2 for actor in self.traffic.actors]).reshape(-1)
-        return np.stack([states[:, 0], states[:, 1], half, half], 1)
+        centres = np.empty((len(self._half_heights), 4))
+        centres[:, :2] = self.traffic.actor_tracks.at(t_us)[0, :, :2]
+        centres[:, 2] = centres[:, 3] = self._half_heights
+        return centres
 
     def describe(self) -> dict[str, Any]:
         """Scenario, style, weather and seed."""
         return {"scenario": self.scenario, "style": self.style, "weather": self.weather, "seed": self.seed}
 
 
-def camera_pose(
-    position: tuple[float, float, float], heading: float, pitch: float, roll: float
-) -> NDArray[np.float64]:
-    """Camera-to-world pose of a forward-looking camera; positive pitch looks down, angles in radians."""
+@njit(cache=True, error_model="numpy")
+def _swaying_pose(motion, t, vibration, camera_height, phases):  # type: ignore[no-untyped-def]
+    """:meth:`DrivingScene.pose` at ``t`` s; ``motion`` is x, y, heading, speed, acceleration of the ego."""
+    x, y, heading, speed, acceleration = motion
+    shake = vibration * min(1.0, speed / 8.0)
+    pitch = shake * (
+        0.18 * _wave(1.3, t, phases[0]) + 0.08 * _wave(3.1, t, phases[1]) + 0.025 * _wave(9.0, t, phases[2])
+    )
+    pitch -= 0.25 * vibration * min(max(acceleration, -4.0), 4.0)
+    roll = shake * (0.15 * _wave(0.9, t, phases[3]) + 0.06 * _wave(4.3, t, phases[4]))
+    z = camera_height + 0.015 * shake * _wave(1.4, t, phases[5])
+    return _pose((x, y, z), heading, pitch * _RADIANS, roll * _RADIANS)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _wave(hz, t, phase):  # type: ignore[no-untyped-def]
+    return math.sin(2 * math.pi * hz * t + phase)
+
+
+@njit(cache=True, error_model="numpy")
+def _pose(position, heading, pitch, roll):  # type: ignore[no-untyped-def]
     ch, sh, cp, sp = math.cos(heading), math.sin(heading), math.cos(pitch), math.sin(pitch)
     cr, sr = math.cos(roll), math.sin(roll)
     right = (sh, -ch, 0.0)
     down = (-ch * sp, -sh * sp, -cp)
-    x, y, z = position
-    return np.array(
-        [
-            [cr * right[0] + sr * down[0], cr * down[0] - sr * right[0], ch * cp, x],
-            [cr * right[1] + sr * down[1], cr * down[1] - sr * right[1], sh * cp, y],
-            [sr * down[2], cr * down[2], -sp, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    ahead = (ch * cp, sh * cp, -sp)
+    pose = np.zeros((4, 4))
+    for k in range(3):
+        pose[k, 0] = cr * right[k] + sr * down[k]
+        pose[k, 1] = cr * down[k] - sr * right[k]
+        pose[k, 2] = ahead[k]
+        pose[k, 3] = position[k]
+    pose[3, 3] = 1.0
+    return pose
+
+
+def camera_pose(
+    position: tuple[float, float, float], heading: float, pitch: float, roll: float
+) -> NDArray[np.float64]:
+    """Camera-to-world pose of a forward-looking camera; positive pitch looks down, angles in radians."""
+    return _pose(tuple(map(float, position)), float(heading), float(pitch), float(roll))

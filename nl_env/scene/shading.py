@@ -14,10 +14,10 @@ import math
 
 from numba import njit
 
+from nl_env.lanes import EXACT, LANES, first_of, fused, leading, load, quotient, row_of, splat, store, to_int
 from nl_env.scene import raster as r
 from nl_env.scene.ground_shading import ground_run
-from nl_env.scene.lanes import EXACT, LANES, fused, leading, load, quotient, row_of, splat, store, to_int
-from nl_env.scene.raster import FAST, INLINE, ONE, ZERO, along, f4, first_of, i4, u8
+from nl_env.scene.raster import FAST, INLINE, ONE, ZERO, along, f4, i4, u8
 from nl_env.scene.texels import LONG_RUN, floor, mip_level, repeating
 from nl_env.scene.textures import LEVELS, SIZE, SKY, UNIT
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from nl_env.scene.lanes import EXACT, fused, gather, splat, to_float, to_int, where
+from nl_env.lanes import EXACT, fused, gather, splat, to_float, to_int, where
 from nl_env.scene.raster import INLINE, i4
 
 LONG_RUN = 16

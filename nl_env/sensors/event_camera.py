@@ -25,17 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.config import EventCameraConfig
-from nl_env.sensors.event_kernels import (
-    MAX_TICK_US,
-    Pixels,
-    Scratch,
-    Tick,
-    all_positive,
-    bin_tick,
-    list_tick,
-    log_levels,
-    sort_events,
-)
+from nl_env.sensors.event_crossings import log_levels
+from nl_env.sensors.event_kernels import all_positive, bin_tick, list_tick, sort_events
+from nl_env.sensors.event_state import MAX_TICK_US, Pixels, Scratch, Tick
 from nl_env.types import BINS, EVENT_DTYPE, SLICE_US
 
 MIN_THRESHOLD = 0.01
@@ -113,6 +105,7 @@ class EventCamera:
             np.add(pixels.level, pixels.on_step, out=pixels.on_at)
         np.subtract(pixels.on_at, window, out=pixels.off_at)
         pixels.last.fill(NEVER)
+        pixels.apart.fill(0)
         self._noise_state[0] = rng.integers(0, 1 << 64, dtype=np.uint64)
         self._time = self._base = int(t_us)
 
@@ -205,6 +198,7 @@ class EventCamera:
         age = self._time - self._base
         for levels in (self._pixels.on_at, self._pixels.off_at):
             levels -= np.float32(age * leak_per_us)
+        self._pixels.apart.fill(1)
         np.maximum(self._pixels.last - np.int64(age), NEVER, out=self._pixels.last, casting="same_kind")
         self._base = self._time
 

@@ -116,10 +116,18 @@ class Tracks:
     def __init__(self, knots: NDArray[np.float64]) -> None:
         self.bodies = knots.shape[1]
         self._rows = np.ascontiguousarray(knots, dtype=np.float64).reshape(len(knots), 3 * self.bodies)
+        self._last: tuple[float, NDArray[np.float64]] | None = None
 
     def at(self, t_us: float) -> NDArray[np.float64]:
-        """``(3, n, 3)``: poses, their first and their second derivative (per second) at ``t_us``."""
-        return evaluate(self._rows, t_us / KNOT_US, 1e6 / KNOT_US).reshape(3, self.bodies, 3)
+        """``(3, n, 3)``: poses, their first and their second derivative (per second) at ``t_us``.
+
+        Not to be written to: camera, labels and renderer ask for the same instant, which is evaluated once.
+        """
+        last = self._last
+        if last is None or last[0] != t_us:
+            found = evaluate(self._rows, t_us / KNOT_US, 1e6 / KNOT_US).reshape(3, self.bodies, 3)
+            self._last = last = (t_us, found)
+        return last[1]
 
     def sample(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:
         """``(T, n, 3)`` poses at ``times_us``."""
@@ -179,7 +187,11 @@ class Traffic:
         """From the ego's outline to the nearest actor's, m; 0 if they touch, ``inf`` without actors."""
         self._check(t_us)
         ego = self.ego_track.at(t_us)[0, 0]
-        return float(nearest(ego, np.array(self.ego_size), self.actor_tracks.at(t_us)[0], self._sizes))
+        return float(nearest(ego, self._ego_size, self.actor_tracks.at(t_us)[0], self._sizes))
+
+    @cached_property
+    def _ego_size(self) -> NDArray[np.float64]:
+        return np.array(self.ego_size)
 
     @cached_property
     def _sizes(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Eight numbers at a time: SIMD values for the renderer's inner loops.
+"""Eight numbers at a time: SIMD values for the inner loops of the renderer and the event camera.
 
 A span of a surface is a few pixels long, and left to itself a compiler works the odd ones off one by one,
 with a jump each. Here kernels say what they want: they handle eight pixels per step, mask the ones beyond
@@ -7,7 +7,8 @@ of an image depend neither on the optimiser nor on where a loop was cut.
 
 Values are vectors of eight float32 (:func:`splat` of a float32), int32, or truth values. ``+``, ``-``, ``*``,
 ``/`` work on floats, ``+``, ``-``, ``&``, ``|``, ``<<`` and ``>>`` (which shifts zeros in) on integers, ``&``
-on truth values, and ``<``, ``>`` compare. None of this may run under a fast-math flag: use :data:`EXACT`.
+and ``|`` on truth values, and ``<``, ``>``, ``<=``, ``>=`` compare. None of this may run under a fast-math
+flag: use :data:`EXACT`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import extending, types
+from numba import extending, njit, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 
@@ -52,6 +53,10 @@ _VECTORS = {
 }
 
 
+_NAMES = {FLOATS: "v8f32", INTS: "v8i32"}
+"""What LLVM's intrinsics call the vectors."""
+
+
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, lanes: Lanes) -> None:
@@ -79,6 +84,8 @@ _operator(operator.mul, FLOATS, FLOATS, ir.IRBuilder.fmul)
 _operator(operator.truediv, FLOATS, FLOATS, ir.IRBuilder.fdiv)
 _operator(operator.lt, FLOATS, TRUTHS, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
 _operator(operator.gt, FLOATS, TRUTHS, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
+_operator(operator.le, FLOATS, TRUTHS, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+_operator(operator.ge, FLOATS, TRUTHS, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 _operator(operator.add, INTS, INTS, ir.IRBuilder.add)
 _operator(operator.sub, INTS, INTS, ir.IRBuilder.sub)
 _operator(operator.mul, INTS, INTS, ir.IRBuilder.mul)
@@ -90,6 +97,7 @@ _operator(operator.lt, INTS, TRUTHS, lambda builder, a, b: builder.icmp_signed("
 _operator(operator.gt, INTS, TRUTHS, lambda builder, a, b: builder.icmp_signed(">", a, b))
 _operator(operator.eq, INTS, TRUTHS, lambda builder, a, b: builder.icmp_signed("==", a, b))
 _operator(operator.and_, TRUTHS, TRUTHS, ir.IRBuilder.and_)
+_operator(operator.or_, TRUTHS, TRUTHS, ir.IRBuilder.or_)
 
 
 def _call(builder: Builder, name: str, result: Any, arguments: list[Value]) -> Value:
@@ -164,6 +172,32 @@ def store(typingctx, row, column, value):  # type: ignore[no-untyped-def]
     return types.none(row, column, value), codegen
 
 
+@intrinsic
+def load_some(typingctx, row, column, wanted, otherwise):  # type: ignore[no-untyped-def]
+    """Like :func:`load` for the ``wanted`` lanes; the others are ``otherwise`` and need not exist."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value, ...]) -> Value:
+        place = _place(builder, otherwise, arguments)
+        name = f"llvm.masked.load.{_NAMES[otherwise]}.p0"
+        how = [place, _INT(4), *arguments[2:]]
+        return _call(builder, name, _VECTORS[otherwise], how)
+
+    return otherwise(row, column, wanted, otherwise), codegen
+
+
+@intrinsic
+def store_some(typingctx, row, column, wanted, value):  # type: ignore[no-untyped-def]
+    """Like :func:`store` for the ``wanted`` lanes; the others are left alone and need not exist."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value, ...]) -> Value:
+        place = _place(builder, value, arguments)
+        name = f"llvm.masked.store.{_NAMES[value]}.p0"
+        _call(builder, name, ir.VoidType(), [arguments[3], place, _INT(4), arguments[2]])
+        return context.get_dummy_value()
+
+    return types.none(row, column, wanted, value), codegen
+
+
 def _place(builder: Builder, lanes: Lanes, arguments: tuple[Value, ...]) -> Value:
     """Address of the vector at a row's element, the first two arguments."""
     return builder.bitcast(builder.gep(arguments[0], [arguments[1]]), _VECTORS[lanes].as_pointer())
@@ -171,21 +205,26 @@ def _place(builder: Builder, lanes: Lanes, arguments: tuple[Value, ...]) -> Valu
 
 @intrinsic
 def gather(typingctx, row, index, wanted):  # type: ignore[no-untyped-def]
-    """Elements ``index`` of a row of 32-bit integers, or of bytes with three spare ones behind.
+    """Elements ``index`` of a row of float32, of 32-bit integers, or of bytes with three spare ones behind.
 
     Lanes that are not ``wanted`` give 0, whatever their index is, and cost no memory access.
     """
-    element = ir.IntType(row.dtype.bitwidth)
+    result = FLOATS if row.dtype == types.float32 else INTS
+    bits = row.dtype.bitwidth
+    element = _SINGLE if result is FLOATS else ir.IntType(bits)
 
     def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value, ...]) -> Value:
         addresses = builder.gep(arguments[0], [arguments[1]], inbounds=True, source_etype=element)
         addresses.type = ir.VectorType(arguments[0].type, LANES)  # the builder knows single addresses only
-        nothing = ir.Constant(_VECTORS[INTS], [0] * LANES)
-        how = [addresses, _INT(element.width // 8), arguments[2], nothing]
-        found = _call(builder, "llvm.masked.gather.v8i32.v8p0", _VECTORS[INTS], how)
-        return builder.and_(found, ir.Constant(_VECTORS[INTS], [(1 << element.width) - 1] * LANES))
+        nothing = ir.Constant(_VECTORS[result], [0] * LANES)
+        how = [addresses, _INT(bits // 8), arguments[2], nothing]
+        name = f"llvm.masked.gather.{_NAMES[result]}.v8p0"
+        found = _call(builder, name, _VECTORS[result], how)
+        if bits == 32:
+            return found
+        return builder.and_(found, ir.Constant(_VECTORS[INTS], [(1 << bits) - 1] * LANES))
 
-    return INTS(row, index, wanted), codegen
+    return result(row, index, wanted), codegen
 
 
 @intrinsic
@@ -249,3 +288,60 @@ def leading(typingctx, condition):  # type: ignore[no-untyped-def]
         return _call(builder, "llvm.cttz.i32", _INT, [beyond, _BIT(1)])
 
     return types.int32(condition), codegen
+
+
+@intrinsic
+def flags(typingctx, condition):  # type: ignore[no-untyped-def]
+    """The lanes as the bits of an int32, the first lane lowest."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value]) -> Value:
+        return builder.zext(builder.bitcast(arguments[0], ir.IntType(LANES)), _INT)
+
+    return types.int32(condition), codegen
+
+
+@intrinsic
+def how_many(typingctx, condition):  # type: ignore[no-untyped-def]
+    """In how many lanes the condition holds, as int32."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value]) -> Value:
+        lanes = builder.zext(builder.bitcast(arguments[0], ir.IntType(LANES)), _INT)
+        return _call(builder, "llvm.ctpop.i32", _INT, [lanes])
+
+    return types.int32(condition), codegen
+
+
+@intrinsic
+def to_bits(typingctx, value):  # type: ignore[no-untyped-def]
+    """The bits of floats, as integers."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value]) -> Value:
+        return builder.bitcast(arguments[0], _VECTORS[INTS])
+
+    return INTS(value), codegen
+
+
+@intrinsic
+def from_bits(typingctx, value):  # type: ignore[no-untyped-def]
+    """The floats of which the integers are the bits."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value]) -> Value:
+        return builder.bitcast(arguments[0], _VECTORS[FLOATS])
+
+    return FLOATS(value), codegen
+
+
+@intrinsic
+def shifted_down(typingctx, value, places):  # type: ignore[no-untyped-def]
+    """Signed integers divided by two ``places`` times, rounded down."""
+
+    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value, Value]) -> Value:
+        return builder.ashr(*arguments)
+
+    return INTS(value, places), codegen
+
+
+@njit(**EXACT)
+def first_of(count):
+    """The first ``count`` lanes."""
+    return ramp() < splat(count)
