@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.depth.metrics import METRIC_NAMES, full_metrics, paper_metrics
+from nl_env.depth.metrics import all_metrics
 from nl_env.history import SensorHistory
 from nl_env.types import DepthExtrapolator, Extrapolation, Sample, SensorStream
 
@@ -95,7 +95,4 @@ class ComputedDepth:
     def _scores(self, sample: Sample) -> Mapping[str, float]:
         """Both metric sets; the paper's, which ignore missing returns, use the depth if there were one."""
         held = self._held
-        paper_depth = held.depth if held.depth_if_return is None else held.depth_if_return
-        paper = paper_metrics(paper_depth, sample.depth, self._max_depth)
-        full = full_metrics(held.depth, sample.depth, self._max_depth, self._min_depth)
-        return dict(zip(METRIC_NAMES, (*paper, *full), strict=True))
+        return all_metrics(held.depth, sample.depth, self._max_depth, self._min_depth, held.depth_if_return)

@@ -3,11 +3,32 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.types import Camera, DepthExtrapolator, ExtrapolationInput, Sample
+
+
+class WindowBins(Sequence[NDArray[np.int16]]):
+    """The bins of some samples, taken from each when they are looked at, which may cost reading them.
+
+    Args:
+        samples: oldest first.
+    """
+
+    def __init__(self, samples: Sequence[Sample]) -> None:
+        self._samples = tuple(samples)
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __getitem__(self, place: Any) -> Any:
+        if isinstance(place, slice):
+            return tuple(sample.bins for sample in self._samples[place])
+        return self._samples[place].bins
 
 
 class SensorHistory:
@@ -21,15 +42,15 @@ class SensorHistory:
         self._max_depth = max_depth
         self._odometry = extrapolator.odometry
         self._lidar_samples: deque[Sample] = deque(maxlen=extrapolator.history)
-        self._bins: list[NDArray[np.int16]] = []
+        self._since: list[Sample] = []
 
     def add(self, sample: Sample) -> None:
         """Take in the next sample; a LiDAR frame restarts the event window."""
         if sample.lidar is None:
-            self._bins.append(sample.bins)
+            self._since.append(sample)
         else:
             self._lidar_samples.append(sample)
-            self._bins = []
+            self._since = []
 
     def inputs(self, sample: Sample) -> ExtrapolationInput:
         """Inputs for a depth frame at ``sample.t``; ``sample`` is the last one added."""
@@ -41,7 +62,7 @@ class SensorHistory:
             max_depth=self._max_depth,
             lidar_frames=tuple(s.lidar for s in lidar_samples if s.lidar is not None),
             lidar_times=tuple(s.t for s in lidar_samples),
-            bins=tuple(self._bins),
+            bins=WindowBins(self._since),
             poses=poses,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,38 @@ from numpy.typing import NDArray
 
 from nl_env.config import DrivingConfig, LidarConfig
 from nl_env.recording import Recording
-from nl_env.representations import frame_from_bins
 from nl_env.sensors.lidar import Lidar
-from nl_env.types import SLICE_US, Sample
+from nl_env.types import SLICE_US, EgoState, Sample
+
+
+class RecordedSample(Sample):
+    """A sample whose bins are read when somebody asks for them."""
+
+    _recording: Recording
+
+    def __init__(
+        self,
+        recording: Recording,
+        index: int,
+        depth: NDArray[np.float32],
+        lidar: NDArray[np.float32] | None,
+        state: EgoState,
+    ) -> None:
+        self.__dict__.update(  # past the frozen fields
+            _recording=recording,
+            index=index,
+            t=index * SLICE_US,
+            event_frame=recording.event_frame(index),
+            event_count=recording.event_count(index),
+            depth=depth,
+            lidar=lidar,
+            state=state,
+        )
+
+    @cached_property
+    def bins(self) -> NDArray[np.int16]:
+        """``(5, H, W)`` int16, signed event sums in the five 4 ms bins of ``[t - SLICE_US, t)``."""
+        return self._recording.bins(self.index)
 
 
 class RecordingStream:
@@ -108,18 +138,9 @@ class RecordingStream:
 
     def _sample(self, recording: Recording) -> Sample:
         k = self._index
-        bins = recording.bins(k)
         depth = recording.depth(k * SLICE_US)
-        return Sample(
-            index=k,
-            t=k * SLICE_US,
-            bins=bins,
-            event_frame=frame_from_bins(bins),
-            event_count=recording.event_count(k),
-            depth=depth,
-            lidar=self._lidar.measure(depth) if k % self.lidar_period == 0 else None,
-            state=recording.state(k),
-        )
+        lidar = self._lidar.measure(depth) if k % self.lidar_period == 0 else None
+        return RecordedSample(recording, k, depth, lidar, recording.state(k))
 
 
 def _check(recording: Recording, seed: int, config: DrivingConfig) -> None:

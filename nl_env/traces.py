@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nl_env.depth.metrics import METRIC_NAMES, full_metrics, paper_metrics
+from nl_env.depth.metrics import METRIC_NAMES, all_metrics
 from nl_env.history import SensorHistory
 from nl_env.keyframes import label_keyframe
 from nl_env.observations import image_observation
@@ -182,11 +182,7 @@ def score(
     produced: Extrapolation, truth: NDArray[np.float32], max_depth: float, min_depth: float
 ) -> dict[str, float]:
     """Every metric of one held frame; the paper's use the depth if there were a return, where it is given."""
-    if_return = produced.depth if produced.depth_if_return is None else produced.depth_if_return
-    return {
-        **paper_metrics(if_return, truth, max_depth)._asdict(),
-        **full_metrics(produced.depth, truth, max_depth, min_depth)._asdict(),
-    }
+    return all_metrics(produced.depth, truth, max_depth, min_depth, produced.depth_if_return)
 
 
 def code_depth(depth: NDArray[np.float32], max_depth: float) -> NDArray[np.uint8]:

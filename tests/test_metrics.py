@@ -8,6 +8,7 @@ from nl_env.depth.metrics import (
     LOWER_IS_BETTER,
     METRIC_NAMES,
     PAPER_METRICS,
+    all_metrics,
     error,
     full_metrics,
     paper_metrics,
@@ -87,6 +88,83 @@ def test_log_follows_the_library_over_its_whole_domain():
     assert paper_metrics(pred, truth, 200.0).log_rmse == pytest.approx(expected, rel=1e-6)
 
 
+def scene(shape, seed):
+    """Prediction and truth with sky, depths beyond the range and below the nearest, and many exact hits."""
+    rng = np.random.default_rng(seed)
+    truth = np.exp(rng.uniform(-1.0, 6.0, shape))
+    pred = truth * np.exp(rng.normal(0.0, 0.3, shape))
+    truth[rng.random(shape) < 0.2], pred[rng.random(shape) < 0.2] = 0, 0
+    exact = rng.random(shape) < 0.3
+    exact.flat[: truth.size // 3] = True
+    return np.where(exact, truth, pred).astype(np.float32), truth.astype(np.float32)
+
+
+def reference(pred, truth, max_depth, min_depth):
+    """Every metric by name, the formulas in float64."""
+    use = (truth > 0) & (truth < max_depth)
+    g, p = truth[use].astype(float), np.maximum(pred[use].astype(float), 1e-8)
+    factor = np.maximum(p / g, g / p)
+    log = np.log(p / g)
+    paper = [
+        np.sqrt(np.mean((p - g) ** 2)),
+        np.sqrt(np.mean(log**2)),
+        np.mean(abs(p - g) / g),
+        np.mean((p - g) ** 2 / g),
+        *(np.mean(factor < 1.25**k) for k in (1, 2, 3)),
+    ]
+    returns = [(depth > 0) & (depth < max_depth) for depth in (pred, truth)]
+    p, g = (
+        np.where(there, np.maximum(depth.astype(float), min_depth), max_depth)
+        for depth, there in zip((pred, truth), returns, strict=True)
+    )
+    factor = np.maximum(p / g, g / p)
+    full = [
+        np.mean(np.log(factor)),
+        1000 * np.mean(abs(1 / p - 1 / g)),
+        1000 * np.sqrt(np.mean((1 / p - 1 / g) ** 2)),
+        np.mean(factor > 1.25),
+        np.mean(factor > 1.1),
+        np.mean(returns[0] & ~returns[1]),
+        np.mean(returns[1] & ~returns[0]),
+    ]
+    return dict(zip(METRIC_NAMES, (*paper, *full), strict=True))
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (1, 8), (3, 5), (7, 9), (120, 160)])
+@pytest.mark.parametrize("limits", [(200.0, 1.0), (9.0, 0.1)])
+def test_both_sets_follow_their_formulas_at_any_size(shape, limits):
+    for seed in range(3):
+        pred, truth = scene(shape, seed)
+        if not np.any((truth > 0) & (truth < limits[0])):
+            continue
+        measured = all_metrics(pred, truth, *limits)
+        assert measured == pytest.approx(reference(pred, truth, *limits), rel=1e-5, abs=1e-7)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 13), (6, 8), (60, 80)])
+def test_both_sets_at_once_are_each_set_in_every_bit(shape):
+    pred, truth = scene(shape, 3)
+    other = np.roll(pred, 1, axis=1)
+    for if_return in (None, pred, other):
+        measured = all_metrics(pred, truth, 200.0, 1.0, if_return)
+        paper = paper_metrics(pred if if_return is None else if_return, truth, 200.0)
+        expected = dict(zip(METRIC_NAMES, (*paper, *full_metrics(pred, truth, 200.0)), strict=True))
+        assert np.array(list(measured.values())).tobytes() == np.array(list(expected.values())).tobytes()
+        assert list(measured) == list(METRIC_NAMES)
+
+
+def test_pixels_are_summed_in_eight_lanes_whatever_the_machine():
+    """Terms are powers of two, so small beside 1 that each is lost or not as the order of summation says."""
+    far = 2.0**100
+    pred = np.full((1, 26), far, np.float32)
+    pred[0, 0], pred[0, [1, 8, 9, 16]], pred[0, 24:] = 1.0, 2.0**53, 2.0**54
+    # Pixels 8 and 16 are lost in the lane of pixel 0, as are 24 and 25 one after the other at the end; 1 and
+    # 9 have a lane of their own and together are large enough.
+    expected = 1.0 + 2.0**-52
+    truth = np.full_like(pred, far)
+    assert full_metrics(pred, truth, 2.0**101, 2.0**-10).imae == 1000.0 * expected / 26
+
+
 def test_errors_are_smaller_for_the_better_prediction():
     truth, good, poor = image(10, 20, 0, 0), image(10, 20, 0, 0), image(30, 0, 20, 0)
     for name in METRIC_NAMES:
@@ -111,7 +189,10 @@ def test_bad_input_is_named():
     for broken in (math.nan, math.inf, -1.0):
         with pytest.raises(ValueError, match="negative or non-finite"):
             full_metrics(image(broken, 20), good, 200.0)
+            all_metrics(good, image(10, broken), 200.0)
     with pytest.raises(ValueError, match="min_depth: found 300"):
         full_metrics(good, good, 200.0, min_depth=300)
+    with pytest.raises(ValueError, match="min_depth: found 0"):
+        all_metrics(good, good, 200.0, min_depth=0)
     with pytest.raises(ValueError, match=r"'mae'.*log_mae.*missed_return"):
         error("mae")

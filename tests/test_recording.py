@@ -5,6 +5,7 @@ import pickle
 import resource
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 
 import h5py
 import numpy as np
@@ -14,6 +15,7 @@ from nl_env.config import DrivingConfig, EventCameraConfig, LidarConfig, SceneCo
 from nl_env.env import AdaptiveDepthEnv
 from nl_env.keyframes import label_keyframe
 from nl_env.recording import Recording, record_sequence
+from nl_env.recording.file import RecordingFile
 from nl_env.recording.schema import Header
 from nl_env.recording.writer import CheckedOutput
 from nl_env.recording_stream import RecordingStream
@@ -133,6 +135,70 @@ def test_events_bins_and_voxel_grids_agree_with_the_live_stream(recording, sampl
     np.testing.assert_array_equal(
         recording.voxel(t0, t1), voxel_grid(everything, recording.camera.shape, t0, t1)
     )
+
+
+def test_event_frames_are_the_sums_of_the_bins(recording, samples):
+    for k, sample in enumerate(samples):
+        frame = recording.event_frame(k)
+        assert frame.dtype == np.int16 and frame.any() == (sample.event_count > 0)
+        np.testing.assert_array_equal(frame, sample.event_frame)
+    for k in (-1, SLICES + 1):
+        with pytest.raises(ValueError, match=r"3\.h5: slice: found"):
+            recording.event_frame(k)
+
+
+def test_rows_are_those_that_hdf5_reads(path):
+    """In any order, within a chunk and across several, and the same when they are read again."""
+    rng = np.random.default_rng(0)
+    columns = ("events/t", "events/x", "events/y", "events/p", "depth/codes", "intensity/frames")
+    with h5py.File(path) as file:
+        content = {name: file[name][:] for name in columns}
+    stored = RecordingFile(path)
+    for name, rows in content.items():
+        for first, last in np.sort(rng.integers(0, len(rows) + 1, (20, 2))).tolist():
+            found = stored.read(name, first, last)
+            assert found.dtype == rows.dtype and found.shape == rows[first:last].shape
+            np.testing.assert_array_equal(found, rows[first:last])
+            found[...] = 0  # does not reach what is kept
+        assert stored.read(name, 0, len(rows)).tobytes() == rows.tobytes()
+    stored.close()
+
+
+@pytest.mark.parametrize("filters", [{}, {"compression": "lzf"}, {"compression": "gzip", "fletcher32": True}])
+def test_files_that_were_packed_otherwise_read_the_same(path, tmp_path, filters):
+    repacked = tmp_path / f"{SEED}.h5"
+    with h5py.File(path) as source, h5py.File(repacked, "w") as target:
+        target.attrs.update(source.attrs)
+        for name in Header(SEED, CONFIG, {}, intensity=True).columns:
+            chunks = (7, *source[name].shape[1:]) if filters else None
+            target.create_dataset(name, data=source[name][:], chunks=chunks, **filters)
+    assert rollout(RecordingStream(repacked), SEED) == rollout(RecordingStream(path), SEED)
+
+
+def test_bins_are_read_when_they_are_asked_for(path, samples, monkeypatch):
+    """An extrapolator that does not look at them costs nothing; whoever does finds them, however late."""
+    stream = RecordingStream(path)
+    early = [stream.reset(SEED), stream.advance(), stream.advance()]
+    with monkeypatch.context() as patched:
+        patched.setattr(Recording, "bins", lambda *_: pytest.fail("bins were read"))
+        env = AdaptiveDepthEnv(stream, extrapolator="repeat")
+        env.reset(seed=SEED)
+        for _ in range(SLICES):
+            env.step(1)
+    env.close()
+    copy = pickle.loads(pickle.dumps(early[2]))
+    for sample, live in zip((*early, copy), (*samples[:3], samples[2]), strict=True):
+        np.testing.assert_array_equal(sample.bins, live.bins)
+
+
+def test_threads_may_share_a_recording(recording):
+    def read(start):
+        return [recording.events(k * SLICE_US, (k + 1) * SLICE_US).tobytes() for k in range(start, SLICES, 2)]
+
+    expected = [read(0), read(1)]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(3):
+            assert list(pool.map(read, (0, 1))) == expected
 
 
 def test_state_and_labels_of_every_slice(recording, samples):

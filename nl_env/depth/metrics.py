@@ -12,8 +12,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from nl_env.depth.error_sums import both_sums, full_sums, paper_sums
 
 ErrorFunction = Callable[[NDArray[np.float32], NDArray[np.float32], float, float], float]
 """``(pred, truth, max_depth, min_depth) -> error``, smaller is better."""
@@ -86,22 +87,7 @@ def paper_metrics(pred: NDArray[np.float32], truth: NDArray[np.float32], max_dep
         ValueError: shapes differ or are not 2-d, or a valid pixel is predicted NaN or infinite.
     """
     pred, truth = _checked(pred, truth)
-    sums = _paper_sums(pred.ravel(), truth.ravel(), np.float32(max_depth))
-    valid = sums[0]
-    if valid == 0:
-        return PaperMetrics(*(math.nan,) * 7)
-    if not math.isfinite(sums[1]):
-        raise ValueError("pred: found NaN or infinity at a valid pixel, expected finite depths in metres")
-    _, squared, squared_log, relative, squared_relative, inside_1, inside_2, inside_3 = sums
-    return PaperMetrics(
-        math.sqrt(squared / valid),
-        math.sqrt(squared_log / valid),
-        relative / valid,
-        squared_relative / valid,
-        inside_1 / valid,
-        inside_2 / valid,
-        inside_3 / valid,
-    )
+    return _paper(paper_sums(pred.ravel(), truth.ravel(), np.float32(max_depth)))
 
 
 def full_metrics(
@@ -119,24 +105,40 @@ def full_metrics(
         ValueError: shapes differ or are not 2-d, limits are not ``0 < min_depth < max_depth``, or
             a depth is negative, NaN or infinite.
     """
-    if not 0 < min_depth < max_depth:
-        raise ValueError(f"min_depth: found {min_depth!r}, expected a value in (0, max_depth={max_depth!r})")
+    _check_limits(min_depth, max_depth)
     pred, truth = _checked(pred, truth)
-    broken, log, inverse, squared_inverse, bad_25, bad_10, false_return, missed_return = _full_sums(
-        pred.ravel(), truth.ravel(), np.float32(max_depth), np.float32(min_depth)
-    )
-    if broken:
-        raise ValueError("pred, truth: found negative or non-finite depths, expected metres, 0 = no return")
-    pixels = pred.size
-    return FullMetrics(
-        log / pixels,
-        1000.0 * inverse / pixels,
-        1000.0 * math.sqrt(squared_inverse / pixels),
-        bad_25 / pixels,
-        bad_10 / pixels,
-        false_return / pixels,
-        missed_return / pixels,
-    )
+    sums = full_sums(pred.ravel(), truth.ravel(), np.float32(max_depth), np.float32(min_depth))
+    return _full(sums, pred.size)
+
+
+def all_metrics(
+    pred: NDArray[np.float32],
+    truth: NDArray[np.float32],
+    max_depth: float,
+    min_depth: float = 1.0,
+    pred_if_return: NDArray[np.float32] | None = None,
+) -> dict[str, float]:
+    """Both sets by name, in the order of :data:`METRIC_NAMES`; one pass over the images where it can be.
+
+    Args:
+        pred, truth, max_depth, min_depth: as :func:`full_metrics`.
+        pred_if_return: ``(H, W)`` float32 m, depth where a return would be, for the paper's metrics, which
+            ignore missing returns; None where it is ``pred``.
+
+    Raises:
+        ValueError: as :func:`paper_metrics` and :func:`full_metrics`.
+    """
+    if pred_if_return is None or pred_if_return is pred:
+        _check_limits(min_depth, max_depth)
+        pred, truth = _checked(pred, truth)
+        paper_parts, full_parts = both_sums(
+            pred.ravel(), truth.ravel(), np.float32(max_depth), np.float32(min_depth)
+        )
+        paper, full = _paper(paper_parts), _full(full_parts, pred.size)
+    else:
+        paper = paper_metrics(pred_if_return, truth, max_depth)
+        full = full_metrics(pred, truth, max_depth, min_depth)
+    return dict(zip(METRIC_NAMES, (*paper, *full), strict=True))
 
 
 def returns_from_depth(depth: NDArray[np.float32], min_return: float = 1.0) -> NDArray[np.float32]:
@@ -164,6 +166,45 @@ def error(name: str) -> ErrorFunction:
     raise ValueError(f"error: found {name!r}, expected one of {', '.join(METRIC_NAMES)}")
 
 
+def _paper(sums: tuple[Any, ...]) -> PaperMetrics:
+    """The metrics of :func:`paper_sums`."""
+    valid, squared, squared_log, relative, squared_relative, inside_1, inside_2, inside_3 = sums
+    if valid == 0:
+        return PaperMetrics(*(math.nan,) * 7)
+    if not math.isfinite(squared):
+        raise ValueError("pred: found NaN or infinity at a valid pixel, expected finite depths in metres")
+    return PaperMetrics(
+        math.sqrt(squared / valid),
+        math.sqrt(squared_log / valid),
+        relative / valid,
+        squared_relative / valid,
+        inside_1 / valid,
+        inside_2 / valid,
+        inside_3 / valid,
+    )
+
+
+def _full(sums: tuple[Any, ...], pixels: int) -> FullMetrics:
+    """The metrics of :func:`full_sums` of an image with ``pixels``."""
+    broken, log, inverse, squared_inverse, bad_25, bad_10, false_return, missed_return = sums
+    if broken:
+        raise ValueError("pred, truth: found negative or non-finite depths, expected metres, 0 = no return")
+    return FullMetrics(
+        log / pixels,
+        1000.0 * inverse / pixels,
+        1000.0 * math.sqrt(squared_inverse / pixels),
+        bad_25 / pixels,
+        bad_10 / pixels,
+        false_return / pixels,
+        missed_return / pixels,
+    )
+
+
+def _check_limits(min_depth: float, max_depth: float) -> None:
+    if not 0 < min_depth < max_depth:
+        raise ValueError(f"min_depth: found {min_depth!r}, expected a value in (0, max_depth={max_depth!r})")
+
+
 def _checked(pred: Any, truth: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     pred = np.ascontiguousarray(pred, np.float32)
     truth = np.ascontiguousarray(truth, np.float32)
@@ -172,87 +213,3 @@ def _checked(pred: Any, truth: Any) -> tuple[NDArray[np.float32], NDArray[np.flo
     if pred.shape != truth.shape:
         raise ValueError(f"pred: found shape {pred.shape}, expected the shape of truth, {truth.shape}")
     return pred, truth
-
-
-# Terms are float32 so that the loops run in SIMD lanes; sums are float64. Only re-association and
-# contraction are allowed, never "no NaN", because NaN is how a broken prediction is found.
-_KERNEL: dict[str, Any] = {
-    "cache": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz"},
-}
-
-_LN2 = np.float32(math.log(2.0))
-_SQRT_HALF_BITS = np.int32(0x3F3504F3)
-_MANTISSA = np.int32(0x007FFFFF)
-_ATANH = tuple(np.float32(2.0 / k) for k in (1, 3, 5, 7, 9))
-_ZERO, _ONE = np.float32(0), np.float32(1)
-_DELTA_1, _DELTA_2, _DELTA_3 = np.float32(1.25), np.float32(1.25**2), np.float32(1.25**3)
-_TEN_PERCENT = np.float32(1.1)
-_FLOOR = np.float32(1e-8)
-_INFINITY = np.float32(np.inf)
-
-
-@njit(forceinline=True, **_KERNEL)
-def _log(x):  # type: ignore[no-untyped-def]
-    """Natural logarithm of a positive normal float32, as arithmetic a compiler can put into SIMD lanes.
-
-    ``x = 2^k m`` with m in [sqrt(1/2), sqrt(2)), and ``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``.
-    """
-    shifted = np.int32(np.float32(x).view(np.int32) - _SQRT_HALF_BITS)
-    k = np.float32(np.int32(shifted >> np.int32(23)))
-    m = np.int32((shifted & _MANTISSA) + _SQRT_HALF_BITS).view(np.float32)
-    s = (m - _ONE) / (m + _ONE)
-    q = s * s
-    series = _ATANH[0] + q * (_ATANH[1] + q * (_ATANH[2] + q * (_ATANH[3] + q * _ATANH[4])))
-    return k * _LN2 + s * series
-
-
-@njit(**_KERNEL)
-def _paper_sums(pred, truth, max_depth):  # type: ignore[no-untyped-def]
-    valid = squared = squared_log = relative = squared_relative = inside_1 = inside_2 = inside_3 = 0.0
-    for i in range(truth.size):
-        g_raw, p_raw = truth[i], pred[i]
-        use = (g_raw > _ZERO) & (g_raw < max_depth)
-        # Pixels without a valid truth add exact zeros: both depths are read as 1 m.
-        g = g_raw if use else _ONE
-        p: Any = p_raw if use else _ONE
-        p = _FLOOR if p < _FLOOR else p
-        ratio = p / g
-        inverse = g / p
-        factor = max(ratio, inverse)
-        difference = p - g
-        log = _log(ratio)
-        valid += use
-        squared += difference * difference
-        squared_log += log * log
-        relative += abs(difference) / g
-        squared_relative += difference * difference / g
-        inside_1 += use & (factor < _DELTA_1)
-        inside_2 += use & (factor < _DELTA_2)
-        inside_3 += use & (factor < _DELTA_3)
-    return valid, squared, squared_log, relative, squared_relative, inside_1, inside_2, inside_3
-
-
-@njit(**_KERNEL)
-def _full_sums(pred, truth, max_depth, min_depth):  # type: ignore[no-untyped-def]
-    broken = log = inverse = squared_inverse = bad_25 = bad_10 = false_return = missed_return = 0.0
-    for i in range(truth.size):
-        g_raw, p_raw = truth[i], pred[i]
-        broken += not ((g_raw >= _ZERO) & (g_raw < _INFINITY) & (p_raw >= _ZERO) & (p_raw < _INFINITY))
-        g_return = (g_raw > _ZERO) & (g_raw < max_depth)
-        p_return = (p_raw > _ZERO) & (p_raw < max_depth)
-        g = max(g_raw, min_depth) if g_return else max_depth
-        p = max(p_raw, min_depth) if p_return else max_depth
-        g_inverse = _ONE / g
-        p_inverse = _ONE / p
-        difference = p_inverse - g_inverse
-        factor = max(p, g) / min(p, g)
-        log += _log(factor)
-        inverse += abs(difference)
-        squared_inverse += difference * difference
-        bad_25 += factor > _DELTA_1
-        bad_10 += factor > _TEN_PERCENT
-        false_return += p_return & (not g_return)
-        missed_return += g_return & (not p_return)
-    return broken, log, inverse, squared_inverse, bad_25, bad_10, false_return, missed_return

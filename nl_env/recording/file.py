@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from nl_env.recording.chunks import ChunkReader
 from nl_env.recording.schema import CHECKSUM, Header
 
 VERIFY_BYTES = 1 << 22
@@ -39,6 +41,8 @@ class RecordingFile:
         self._process = 0
         self._header: Header | None = None
         self._datasets: dict[str, h5py.Dataset] = {}
+        self._readers: dict[str, ChunkReader | None] = {}
+        self._lock = threading.Lock()
         self._arrays: dict[str, NDArray[Any]] = {}
 
     @property
@@ -55,18 +59,33 @@ class RecordingFile:
 
     def read(self, name: str, first: int, last: int) -> NDArray[Any]:
         """Rows ``[first, last)`` of a dataset."""
-        self._open()
-        with naming_damage(self.path, name):
-            return self._datasets[name][first:last]
+        return self.look(name, first, last).copy()
 
-    def array(self, name: str) -> NDArray[Any]:
-        """A whole small dataset, read once and kept; read-only."""
+    def look(self, name: str, first: int, last: int) -> NDArray[Any]:
+        """:meth:`read` without a copy where there need not be one: not to be written to."""
         self._open()
-        if name not in self._arrays:
-            array = self.read(name, 0, self.rows(name))
+        try:
+            with self._lock:
+                if name not in self._readers:
+                    self._readers[name] = ChunkReader.of(self._datasets[name])
+                reader = self._readers[name]
+                rows = None if reader is None else reader.rows(first, last)
+            return self._datasets[name][first:last] if rows is None else rows
+        except DAMAGE as error:
+            raise _damaged(self.path, name, error) from error
+
+    def array(self, name: str, check: Callable[[NDArray[Any]], None] | None = None) -> NDArray[Any]:
+        """A whole small dataset, read and checked once, and kept; read-only."""
+        self._open()
+        array = self._arrays.get(name)
+        if array is None:
+            with naming_damage(self.path, name):
+                array = self._datasets[name][:]
             array.flags.writeable = False
+            if check is not None:
+                check(array)
             self._arrays[name] = array
-        return self._arrays[name]
+        return array
 
     def verify(self) -> None:
         """Compare every dataset with its checksum; raises ``ValueError`` naming the first that differs."""
@@ -89,6 +108,7 @@ class RecordingFile:
         self._file = None
         self._header = None
         self._datasets = {}
+        self._readers = {}
         self._arrays = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -108,6 +128,11 @@ class RecordingFile:
                 file.close()
                 raise
         self._file, self._header, self._process = file, header, os.getpid()
+        self._lock = threading.Lock()  # a forked child may have inherited one that is held
+
+
+DAMAGE = (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError)
+"""What reading a damaged file raises."""
 
 
 @contextmanager
@@ -117,5 +142,9 @@ def naming_damage(path: Path, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError:
         raise
-    except (OSError, KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: {what} ({error})") from error
+    except DAMAGE as error:
+        raise _damaged(path, what, error) from error
+
+
+def _damaged(path: Path, what: str, error: Exception) -> ValueError:
+    return ValueError(f"{path}: {what} ({error})")

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from nl_env.config import DrivingConfig
 from nl_env.recording.file import RecordingFile, naming_damage
 from nl_env.recording.schema import EVENT_FIELDS, Header
-from nl_env.representations import validate_events, voxel_grid
+from nl_env.recording.sums import add_binned_events, add_events
+from nl_env.representations import frame_from_bins, validate_events, voxel_grid
 from nl_env.sensors.lidar import decode
 from nl_env.types import BINS, EVENT_DTYPE, SLICE_US, TICK_US, TICKS_PER_SLICE, Camera, EgoState
+
+_BIN_EDGES = np.arange(-BINS, 1, dtype=np.int64) * (SLICE_US // BINS)
+"""First microsecond of each bin of a slice, and its end, counted from its end."""
 
 
 class Recording:
@@ -93,12 +97,12 @@ class Recording:
             )
         ticks = self._index("tick_index")
         first, last = int(ticks[t0_us // TICK_US]), int(ticks[-(-t1_us // TICK_US)])
-        times = self._file.read("events/t", first, last)
+        times = self._file.look("events/t", first, last)
         start, stop = (int(cut) for cut in np.searchsorted(times, (t0_us, t1_us)))
         events = np.empty(stop - start, EVENT_DTYPE)
         events["t"] = times[start:stop]
         for name in ("x", "y", "p"):
-            events[name] = self._file.read(f"events/{name}", first + start, first + stop)
+            events[name] = self._file.look(f"events/{name}", first + start, first + stop)
         return events
 
     def event_count(self, k: int) -> int:
@@ -115,9 +119,24 @@ class Recording:
     def bins(self, k: int) -> NDArray[np.int16]:
         """``(5, H, W)`` int16, the signed sums of slice ``k`` in its five 4 ms bins; zeros for slice 0."""
         self._check_slice(k)
+        bins = np.zeros((BINS, *self.camera.shape), np.int16)
         if k == 0:
-            return np.zeros((BINS, *self.camera.shape), np.int16)
-        return self.voxel((k - 1) * SLICE_US, k * SLICE_US).astype(np.int16)
+            return bins
+        t, x, y, p = (self._column(name, k) for name in ("t", "x", "y", "p"))
+        if add_binned_events(t, x, y, p, _BIN_EDGES + k * SLICE_US, bins):
+            return bins
+        return self.voxel((k - 1) * SLICE_US, k * SLICE_US).astype(np.int16)  # which says what is wrong
+
+    def event_frame(self, k: int) -> NDArray[np.int16]:
+        """``(H, W)`` int16, the event frame (Eq. 1) of slice ``k``: the sum of :meth:`bins`, for less."""
+        self._check_slice(k)
+        frame = np.zeros(self.camera.shape, np.int16)
+        if k == 0:
+            return frame
+        x, y, p = (self._column(name, k) for name in ("x", "y", "p"))
+        if add_events(x, y, p, frame):
+            return frame
+        return frame_from_bins(self.bins(k))
 
     def voxel(self, t0_us: int, t1_us: int) -> NDArray[np.float32]:
         """``(5, H, W)`` float32, the voxel grid (Eq. 2) of ``[t0_us, t1_us)``."""
@@ -129,7 +148,8 @@ class Recording:
 
     def depth(self, t_us: int) -> NDArray[np.float32]:
         """``(H, W)`` float32 m at ``t_us`` as a dense LiDAR measures it, 0 = no return."""
-        return decode(self.depth_codes(t_us), self.max_depth)
+        frame = self._frame(t_us)
+        return decode(self._file.look("depth/codes", frame, frame + 1)[0], self.max_depth)
 
     def depth_codes(self, t_us: int) -> NDArray[np.uint16]:
         """``(H, W)`` uint16, :meth:`depth` in steps of ``max_depth / 65535``."""
@@ -184,12 +204,13 @@ class Recording:
     def state(self, k: int) -> EgoState:
         """Ego state at the end of slice ``k``."""
         self._check_slice(k)
+        frame, array = k * (SLICE_US // self.depth_period_us), self._file.array
         return EgoState(
-            pose=self.pose(k * SLICE_US),
-            twist=self.twist(k * SLICE_US),
-            speed=float(self.speed[k]),
-            shortest_distance=float(self.shortest_distance[k]),
-            new_actors=int(self.new_actors[k]),
+            pose=array("depth/pose")[frame].copy(),
+            twist=array("depth/twist")[frame].copy(),
+            speed=float(array("state/speed")[k]),
+            shortest_distance=float(array("state/shortest_distance")[k]),
+            new_actors=int(array("state/new_actors")[k]),
         )
 
     def intensity(self, k: int) -> NDArray[np.uint8]:
@@ -247,14 +268,20 @@ class Recording:
 
     def _index(self, name: str) -> NDArray[np.int64]:
         """Offsets into the events, checked: they ascend from 0 to the number of events."""
-        index = self._file.array(f"events/{name}")
+        return self._file.array(f"events/{name}", lambda index: self._check_index(name, index))
+
+    def _column(self, name: str, k: int) -> NDArray[Any]:
+        """One column of the events of slice ``k``, not to be written to."""
+        cuts = self._index("slice_index")
+        return self._file.look(f"events/{name}", int(cuts[k - 1]), int(cuts[k]))
+
+    def _check_index(self, name: str, index: NDArray[np.int64]) -> None:
         lengths = {self._file.rows(f"events/{field}") for field in EVENT_FIELDS}
         if index[0] != 0 or lengths != {int(index[-1])} or np.any(index[1:] < index[:-1]):
             raise ValueError(
                 f"{self.path}: events/{name}: found offsets from {index[0]} to {index[-1]}, "
                 f"expected them to ascend from 0 to the number of events, {sorted(lengths)}"
             )
-        return index
 
     def _frame(self, t_us: int) -> int:
         frame, rest = divmod(int(t_us), self.depth_period_us)
