@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -36,7 +37,7 @@ from agents.keyframe_cnn import FrameDetector
 from nl_env.config import SPLITS, DrivingConfig, choice
 from nl_env.depth.extrapolators import WEIGHTS, PaperUNet, Warp
 from nl_env.depth.learned import MotionWarpRefine
-from nl_env.depth.learned_networks import load_learned
+from nl_env.depth.learned_networks import load_learned, run_refinement
 from nl_env.depth.runtime import NetworkRunner
 from nl_env.depth.unet import UNet, load_released
 from nl_env.history import SensorHistory
@@ -162,15 +163,15 @@ def extrapolator_calls(
     name: str, row: Row, args: Args, intervals: Sequence[Sequence[ExtrapolationInput]]
 ) -> list[Call]:
     """One call a LiDAR interval of an extrapolator that is triggered at every moment of it."""
-    runner = partial(NetworkRunner, runtime=row[0], threads=args.threads, precision=row[1])
+    how: dict[str, Any] = {"runtime": row[0], "threads": args.threads, "precision": row[1]}
     extrapolator: DepthExtrapolator
     if name == EXTRAPOLATORS[0]:
-        extrapolator = PaperUNet(runner(paper_network(args)))
+        extrapolator = PaperUNet(NetworkRunner(paper_network(args), **how))
     else:
         ours = load_learned(args.ours)
         extrapolator = MotionWarpRefine(
-            None if ours.motion is None else runner(ours.motion),
-            None if ours.refine is None else runner(ours.refine),
+            None if ours.motion is None else NetworkRunner(ours.motion, **how),
+            None if ours.refine is None else run_refinement(ours.refine, **how),
             threshold=ours.threshold,
             warped=ours.warped,
             events=ours.events,

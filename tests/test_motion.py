@@ -3,7 +3,7 @@ import pytest
 
 from nl_env.depth.extrapolators import Warp
 from nl_env.depth.metrics import full_metrics
-from nl_env.depth.motion import continued, estimate_motion, se3_exp, se3_log
+from nl_env.depth.motion import IntervalMotion, continued, estimate_motion, se3_exp, se3_log
 from nl_env.types import Camera, ExtrapolationInput
 
 CAMERA = Camera.from_fov(120, 160, 70.0)
@@ -114,6 +114,17 @@ def test_estimate_is_a_function_of_its_frames():
         estimate_motion(old, new[:2, :2], CAMERA, RANGE)
     with pytest.raises(ValueError, match=r"guess: found shape \(3, 3\)"):
         estimate_motion(old, new, CAMERA, RANGE, np.eye(3))
+
+
+def test_estimates_do_not_depend_on_threads_and_are_continued_as_they_are(monkeypatch):
+    old, new = street(np.eye(4)), street(se3_exp(np.array([0.1, 0, 1.0, 0, 0.02, 0])))
+    monkeypatch.setattr("nl_env.depth.threads.WORTH", 1)
+    interval = IntervalMotion()
+    alone = estimate_motion(old, new, CAMERA, RANGE, threads=1)
+    for threads in (2, 3):
+        np.testing.assert_array_equal(estimate_motion(old, new, CAMERA, RANGE, threads=threads), alone)
+    np.testing.assert_array_equal(interval(old, new, CAMERA, RANGE), alone)
+    np.testing.assert_array_equal(interval.continued(0.4), continued(alone, 0.4))
 
 
 def test_warp_with_estimated_motion_beats_repeat_whenever_it_is_triggered():

@@ -219,7 +219,7 @@ def test_blocks_of_pixels_become_channels_and_pixels_again(runtime, factor, widt
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("factor", [1, 2, 3, 4])
 def test_folding_is_what_pytorch_does_with_the_channels_of_a_pixel_side_by_side(factor):
     image = torch.randn(2, 3, 6 * factor, 19 * factor)
     there = folded(image, factor)
@@ -251,6 +251,47 @@ def test_bf16_is_close_and_not_the_same(network):
     expected = eager(network, images())[0]
     (found, _) = compiled(network, images(), "openvino", precision="bf16")(*images())
     np.testing.assert_allclose(found, expected, rtol=0.1, atol=0.1)
+
+
+def test_bf16_keeps_float32_before_the_first_costly_convolution_and_on_small_images():
+    class Network(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.enter = nn.Conv2d(1, 4, 1)
+            self.wide = nn.Conv2d(4, 16, 3, padding=1)
+            self.small = nn.Conv2d(16, 1, 1)
+            self.up = nn.ConvTranspose2d(1, 1, 2, stride=2)
+            self.leave = nn.Conv2d(1, 1, 1)
+
+        def forward(self, x):
+            small = self.small(functional.max_pool2d(functional.relu(self.wide(self.enter(x))), 2))
+            return self.leave(self.up(small))
+
+    openvino = pytest.importorskip("openvino")
+    pytest.importorskip("onnx")
+    from nl_env.depth.runtime.onnx_export import export_onnx
+    from nl_env.depth.runtime.openvino_cpu import _keep_precise
+
+    core = openvino.Core()
+    image = np.zeros((1, 1, 16, 16), np.float32)
+    model = core.read_model(model=export_onnx(Network().eval(), (image,)))
+    marked = _keep_precise(core, model).get_ordered_ops()
+    precise = [
+        any("PrecisionConversion" in mark for mark in op.get_rt_info())
+        for op in marked
+        if "Convolution" in op.get_type_name()
+    ]
+    assert precise == [True, False, True, False, False]
+
+
+def test_bf16_of_a_network_without_convolutions():
+    class Sum(nn.Module):
+        def forward(self, x):
+            return x + 1
+
+    image = np.ones((1, 1, 4, 4), np.float32)
+    (found,) = compiled(Sum(), (image,), "openvino", precision="bf16")(image)
+    np.testing.assert_array_equal(found, 2)
 
 
 def test_a_runner_compiles_for_every_shape_and_pickles(network):

@@ -17,7 +17,7 @@ from nl_env.depth import baselines
 from nl_env.depth.exported import load_parts, read_export
 from nl_env.depth.learned import MotionWarpRefine
 from nl_env.depth.metrics import returns_from_depth
-from nl_env.depth.motion import IntervalMotion, continued
+from nl_env.depth.motion import IntervalMotion
 from nl_env.depth.runtime import RUNTIMES, CompiledNetwork, NetworkRunner
 from nl_env.depth.warp import warp
 from nl_env.representations import voxel_from_bins
@@ -108,8 +108,8 @@ class Warp:
         else:
             period, gap = _period_and_gap(inputs)
             previous, last = inputs.lidar_frames[-2:]
-            interval = self._interval(previous, last, inputs.camera, inputs.max_depth)
-            motion = continued(interval, gap / period)
+            self._interval(previous, last, inputs.camera, inputs.max_depth)
+            motion = self._interval.continued(gap / period)
         return Extrapolation(warp(last, inputs.camera, motion, inputs.max_depth))
 
 
@@ -218,6 +218,7 @@ def make_extrapolator(
 def _from_weights(path: Path, odometry: bool, runtime: str, precision: str | None) -> DepthExtrapolator:
     """Ours or the paper's, as the card says; without a card, the released network."""
     try:
+        from nl_env.depth.learned_networks import run_refinement
         from nl_env.depth.networks import UNet, load_networks
     except ImportError as cause:
         raise ImportError("extrapolator: networks need PyTorch (pip install torch)") from cause
@@ -231,7 +232,7 @@ def _from_weights(path: Path, odometry: bool, runtime: str, precision: str | Non
         return PaperUNet(running(network))
     return MotionWarpRefine(
         None if network.motion is None else running(network.motion),
-        None if network.refine is None else running(network.refine),
+        None if network.refine is None else run_refinement(network.refine, runtime, precision=precision),
         threshold=network.threshold,
         warped=network.warped,
         events=network.events,

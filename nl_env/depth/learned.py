@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nl_env.depth.features import CHANNELS, Scene, features, hide_events
-from nl_env.depth.motion import IntervalMotion, continued
+from nl_env.depth.motion import IntervalMotion
 from nl_env.depth.refine_answer import depth_frames
 from nl_env.depth.threads import usable_threads
 from nl_env.depth.twist import corrected
@@ -113,9 +113,9 @@ class MotionWarpRefine:
             if previous is not None:
                 last = np.linalg.inv(here) @ before[-1]
         elif previous is not None:
-            last = self._interval(previous, prior, inputs.camera, inputs.max_depth)
+            last = self._interval(previous, prior, inputs.camera, inputs.max_depth, self._threads)
             period = (inputs.lidar_times[-1] - inputs.lidar_times[-2]) * 1e-6
-            motion = continued(last, gap / period)
+            motion = self._interval.continued(gap / period)
         voxel = voxel_from_bins(inputs.bins)
         return Scene(inputs.camera, inputs.max_depth, prior, previous, last, voxel, gap), motion
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import nn
 
 from nl_env.depth.motion_network import MotionNetwork
-from nl_env.depth.refine import RefineNetwork
+from nl_env.depth.refine import BlockConvolutions, RefineNetwork
+from nl_env.depth.refine_blocks import RefinementInBlocks
+from nl_env.depth.runtime import NetworkRunner
 from nl_env.weight_files import load_network
 
 ARCHITECTURE = "motion-warp-refine"
@@ -50,3 +54,25 @@ def load_learned(path: Path) -> LearnedNetworks:
     """
     network, _ = load_network(path, {ARCHITECTURE: LearnedNetworks})
     return cast(LearnedNetworks, network)
+
+
+def run_refinement(
+    network: RefineNetwork,
+    runtime: str = "auto",
+    *,
+    threads: int | None = None,
+    precision: str | None = None,
+) -> Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], ...]]:
+    """``network`` from arrays to arrays, as fast as the runtime allows; what it gives pickles.
+
+    OpenVINO and ONNX Runtime run the convolutions alone where that is possible
+    (:mod:`nl_env.depth.refine_blocks`); the answers are the same but for rounding.
+
+    Args: as :class:`nl_env.depth.runtime.NetworkRunner`.
+    """
+    if runtime in ("openvino", "onnxruntime") and network.heads == 3 and network.fine is None:
+        convolutions = NetworkRunner(
+            BlockConvolutions(network), runtime, threads=threads, precision=precision
+        )
+        return RefinementInBlocks(convolutions, threads)
+    return NetworkRunner(network, runtime, threads=threads, precision=precision)

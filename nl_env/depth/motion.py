@@ -10,12 +10,14 @@ weights against moving objects, edges and disocclusions.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from nl_env.depth.threads import together, usable_threads
 from nl_env.depth.warp import inverse_depth
 from nl_env.types import Camera
 
@@ -79,6 +81,8 @@ def estimate_motion(
     camera: Camera,
     max_depth: float,
     guess: NDArray[np.float64] | None = None,
+    *,
+    threads: int | None = None,
 ) -> NDArray[np.float64]:
     """Rigid motion that takes points from the old frame's camera to the new frame's.
 
@@ -90,6 +94,7 @@ def estimate_motion(
         camera: intrinsics of both.
         max_depth: sensor range, m.
         guess: ``(4, 4)`` start, for instance the previous motion; default standing still.
+        threads: at most, see :func:`nl_env.depth.threads.usable_threads`; the result is the same.
 
     Returns:
         ``(4, 4)`` float64.
@@ -104,6 +109,7 @@ def estimate_motion(
     if start.shape != (4, 4):
         raise ValueError(f"guess: found shape {start.shape}, expected (4, 4)")
 
+    threads = usable_threads(camera.shape, threads)
     sources = _pyramid(inverse_depth(np.ascontiguousarray(old, np.float32), max_depth))
     targets = _pyramid(inverse_depth(np.ascontiguousarray(new, np.float32), max_depth))
     levels = [
@@ -111,13 +117,27 @@ def estimate_motion(
         for source, target, scale in zip(sources, targets, SCALES, strict=False)
     ]
     *finer, coarsest = levels
-    trials = [_align(*coarsest, _ahead(start, metres), ITERATIONS, CONVERGED, _DAMPING) for metres in STARTS]
-    cost, motion = min(trials, key=lambda trial: trial[0])
+    starts = [_ahead(start, metres) for metres in STARTS]
+    aligned = [(math.inf, start)] * len(starts)
+
+    def align(first: int) -> None:
+        for k in range(first, len(starts), threads):
+            aligned[k] = _align(*coarsest, starts[k], ITERATIONS, CONVERGED, _DAMPING)
+
+    together([partial(align, first) for first in range(threads)], threads)
+    cost, motion = min(aligned, key=lambda trial: trial[0])
     for level in reversed(finer):
         cost, motion = _align(*level, motion, ITERATIONS, CONVERGED, _DAMPING)
     finest = levels[0]
-    ahead = np.arange(0.0, AHEAD_MOST + AHEAD_STEP / 2, AHEAD_STEP)
-    other = _best_ahead(*finest, motion, start[2, 3] - ahead)
+    places = start[2, 3] - np.arange(0.0, AHEAD_MOST + AHEAD_STEP / 2, AHEAD_STEP)
+    costs = np.empty(len(places))
+
+    def compare(first: int) -> None:
+        _costs_ahead(*finest, motion, places[first::threads], costs[first::threads])
+
+    together([partial(compare, first) for first in range(threads)], threads)
+    other = motion.copy()
+    other[2, 3] = places[np.argmin(np.nan_to_num(costs, nan=np.inf))]
     other_cost, other = _align(*finest, other, ITERATIONS, CONVERGED, _DAMPING)
     return other if other_cost < cost else motion
 
@@ -127,16 +147,26 @@ class IntervalMotion:
 
     def __init__(self) -> None:
         self._frames: tuple[NDArray[np.float32], ...] = ()
-        self._motion = np.eye(4)
+        self._motion, self._twist = np.eye(4), np.zeros(6)
 
     def __call__(
-        self, previous: NDArray[np.float32], last: NDArray[np.float32], camera: Camera, max_depth: float
+        self,
+        previous: NDArray[np.float32],
+        last: NDArray[np.float32],
+        camera: Camera,
+        max_depth: float,
+        threads: int | None = None,
     ) -> NDArray[np.float64]:
         """Motion ``(4, 4)`` from ``previous`` to ``last``, which are told apart by identity."""
         if not (self._frames and self._frames[0] is previous and self._frames[1] is last):
-            self._motion = estimate_motion(previous, last, camera, max_depth)
+            self._motion = estimate_motion(previous, last, camera, max_depth, threads=threads)
+            self._twist = se3_log(self._motion)
             self._frames = (previous, last)
         return self._motion
+
+    def continued(self, fraction: float) -> NDArray[np.float64]:
+        """:func:`continued` for the motion that was asked for last."""
+        return se3_exp(fraction * self._twist)
 
 
 def _ahead(motion: NDArray[np.float64], metres: float) -> NDArray[np.float64]:
@@ -193,7 +223,7 @@ def _halved(image):  # type: ignore[no-untyped-def]
     return half
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _align(source, target, intrinsics, scale, stride, motion, iterations, converged, damping):  # type: ignore[no-untyped-def]
     """Gauss-Newton at one level; the best cost seen and its motion."""
     best_cost, best = np.inf, motion
@@ -213,17 +243,13 @@ def _align(source, target, intrinsics, scale, stride, motion, iterations, conver
     return best_cost, best
 
 
-@njit(cache=True, error_model="numpy")
-def _best_ahead(source, target, intrinsics, scale, stride, motion, places):  # type: ignore[no-untyped-def]
-    """``motion`` with that of ``places`` (m along the optical axis) that costs least."""
-    best_cost, best = np.inf, motion
-    for place in places:
-        trial = motion.copy()
-        trial[2, 3] = place
-        cost = _cost(source, target, intrinsics, scale, stride, trial)
-        if cost < best_cost:
-            best_cost, best = cost, trial
-    return best
+@njit(cache=True, error_model="numpy", nogil=True)
+def _costs_ahead(source, target, intrinsics, scale, stride, motion, places, costs):  # type: ignore[no-untyped-def]
+    """What ``motion`` costs with each of ``places`` (m along the optical axis)."""
+    trial = motion.copy()
+    for k in range(places.size):
+        trial[2, 3] = places[k]
+        costs[k] = _cost(source, target, intrinsics, scale, stride, trial)
 
 
 @njit(cache=True, error_model="numpy")

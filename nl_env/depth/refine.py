@@ -19,26 +19,10 @@ from torch.nn import functional
 
 from nl_env.depth.features import CHANNELS
 from nl_env.depth.layers import Residual, zeroed
-
-FOLD = 2
-"""Blocks of 2x2 pixels become channels before the first convolution: the same work at a quarter of the
-places, which trains and runs faster on a CPU than few channels at full resolution, and learns more."""
+from nl_env.depth.refine_blocks import AROUND, FOLD, LONELY, PARTS, RETURN, SOMEWHERE, SURE, WARPED
 
 STRIDE = 8
 """Image sides must be multiples of this."""
-
-WARPED, RETURN = CHANNELS.index("warped log depth"), CHANNELS.index("warped return")
-_AROUND = 9
-"""Pixels across the window in which a missing return takes after its neighbours; a power of two and one."""
-
-_SOMEWHERE, _LONELY = 0.5, 0.01
-"""Coded log depth (about 40 m) of a missing return with no other around, and its weight against them."""
-
-_PARTS = (2, 2, 1)
-"""Outputs per pixel: change and gate of either depth, and the return."""
-
-_SURE = 4.0
-"""Logit with which an untrained network keeps a return, or none."""
 
 _GAIN = 0.1
 """Of the head: Adam's first steps move every weight alike, and with hundreds of inputs per output they
@@ -60,7 +44,7 @@ class RefineNetwork(nn.Module):
             raise ValueError(f"heads: found {heads!r}, expected 1 or 3")
         self.heads = heads
         steps = list(pairwise(channels))
-        first, outputs = channels[0], sum(_PARTS)
+        first, outputs = channels[0], sum(PARTS)
         self.stem = nn.Conv2d(len(CHANNELS) * FOLD**2, first, 3, padding=1)
         self.enter = Residual(first)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in steps)
@@ -85,7 +69,26 @@ class RefineNetwork(nn.Module):
         Args:
             features: ``(N, C, H, W)``.
         """
-        x = functional.pixel_unshuffle(features, FOLD)
+        x = self.mixed(functional.pixel_unshuffle(features, FOLD))
+        if self.fine is None:
+            outputs = functional.pixel_shuffle(_GAIN * self.head(x), FOLD)
+        else:
+            unfold, mix = self.fine
+            x = torch.cat([functional.pixel_shuffle(unfold(x), FOLD), features], dim=1)
+            outputs = _GAIN * self.head(functional.relu(mix(x)))
+        change, change_if, logit = outputs.split(PARTS, dim=1)
+        base, returned = features[:, WARPED : WARPED + 1], features[:, RETURN : RETURN + 1]
+        depth, free, gate = _changed(base, change)
+        if self.heads == 1:
+            certain = torch.full_like(depth, SURE)
+            answer, free_if, gate_if = torch.cat([depth, certain, depth], dim=1), free, gate
+        else:
+            depth_if, free_if, gate_if = _changed(_filled(base, returned), change_if)
+            answer = torch.cat([depth, logit + SURE * (2 * returned - 1), depth_if], dim=1)
+        return torch.cat([answer, free, gate, free_if, gate_if], dim=1) if self.training else answer
+
+    def mixed(self, x: Tensor) -> Tensor:
+        """Features ``(N, c, H/2, W/2)`` behind the U-Net from blocks of pixels ``(N, 4 C, H/2, W/2)``."""
         x = self.enter(functional.relu(self.stem(x)))
         skips = []
         for down, deep in zip(self.down, self.deep, strict=True):
@@ -93,37 +96,39 @@ class RefineNetwork(nn.Module):
             x = deep(functional.relu(down(x)))
         for up, leave in zip(reversed(self.up), reversed(self.leave), strict=True):
             x = leave(up(x) + skips.pop())
-        if self.fine is None:
-            outputs = functional.pixel_shuffle(_GAIN * self.head(x), FOLD)
-        else:
-            unfold, mix = self.fine
-            x = torch.cat([functional.pixel_shuffle(unfold(x), FOLD), features], dim=1)
-            outputs = _GAIN * self.head(functional.relu(mix(x)))
-        change, change_if, logit = outputs.split(_PARTS, dim=1)
-        base, returned = features[:, WARPED : WARPED + 1], features[:, RETURN : RETURN + 1]
-        depth, free, gate = _changed(base, change)
-        if self.heads == 1:
-            certain = torch.full_like(depth, _SURE)
-            answer, free_if, gate_if = torch.cat([depth, certain, depth], dim=1), free, gate
-        else:
-            depth_if, free_if, gate_if = _changed(_filled(base, returned), change_if)
-            answer = torch.cat([depth, logit + _SURE * (2 * returned - 1), depth_if], dim=1)
-        return torch.cat([answer, free, gate, free_if, gate_if], dim=1) if self.training else answer
+        return x
+
+
+class BlockConvolutions(nn.Module):
+    """What :class:`nl_env.depth.refine_blocks.RefinementInBlocks` leaves to a network.
+
+    Args:
+        network: of three heads, without convolutions at full resolution.
+    """
+
+    def __init__(self, network: RefineNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, blocks: Tensor) -> Tensor:
+        """``(N, H/2, W/2, 20)`` outputs of the head from blocks of features ``(N, H/2, W/2, 4 C)``."""
+        x = self.network.mixed(blocks.permute(0, 3, 1, 2))
+        return (_GAIN * self.network.head(x)).permute(0, 2, 3, 1)
 
 
 def _filled(code: Tensor, returned: Tensor) -> Tensor:
     """Coded log depth with the mean of the returns around where there is none: a leaf hides beside leaves."""
     total, count = _means_around(torch.cat([code * returned, returned], dim=1)).split(1, dim=1)
-    around = (total + _LONELY * _SOMEWHERE) / (count + _LONELY)
+    around = (total + LONELY * SOMEWHERE) / (count + LONELY)
     return returned * code + (1 - returned) * around
 
 
 def _means_around(image: Tensor) -> Tensor:
-    """Means over ``_AROUND x _AROUND`` pixels, zeros beyond the border.
+    """Means over ``AROUND x AROUND`` pixels, zeros beyond the border.
 
     Sums of two, four and eight neighbours and the ninth: a third of the time of ``avg_pool2d``.
     """
-    x = functional.pad(image, (_AROUND // 2,) * 4)
+    x = functional.pad(image, (AROUND // 2,) * 4)
     for dim in (2, 3):
         total = x
         for step in (1, 2, 4):
@@ -131,7 +136,7 @@ def _means_around(image: Tensor) -> Tensor:
             total = total.narrow(dim, 0, length) + total.narrow(dim, step, length)
         length = x.shape[dim] - 8
         x = total.narrow(dim, 0, length) + x.narrow(dim, 8, length)
-    return x * (1 / _AROUND**2)
+    return x * (1 / AROUND**2)
 
 
 def _changed(base: Tensor, change: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -96,7 +96,7 @@ def compile_network(
         threads: at most this many; default :func:`default_threads`. PyTorch's own setting is never
             raised, so ``torch.set_num_threads(1)`` still holds.
         precision: ``"fp32"``; ``"bf16"`` with OpenVINO; CUDA computes in ``"fp16"`` unless told otherwise.
-        keep_memory: with ``"torch"``, have glibc keep freed blocks in this process
+        keep_memory: on a CPU, have glibc keep freed blocks in this process
             (:func:`nl_env.depth.runtime.allocator.keep_large_blocks`).
 
     Raises:
@@ -115,11 +115,11 @@ def compile_network(
     examples = [np.array(example, order="C") for example in example_inputs]
     shapes = [example.shape for example in examples]
     run: Run
+    if keep_memory and runtime != "cuda":
+        keep_large_blocks()
     if runtime == "torch":
         from nl_env.depth.runtime.torch_cpu import TorchNetwork
 
-        if keep_memory:
-            keep_large_blocks()
         run = TorchNetwork(network, examples, threads)
     elif runtime == "cuda":
         from nl_env.depth.runtime.cuda import CudaNetwork
