@@ -6,7 +6,8 @@ run of slices through a memory map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -126,7 +127,28 @@ class FrameSource(Protocol):
         ...
 
 
-class Slices(CutSet):
+class MappedSlices(FrameSource):
+    """A :class:`FrameSource` of rows of :func:`slice_dtype`, which also hold what a frame shows."""
+
+    @abstractmethod
+    def sequence(self, number: int) -> NDArray[Any]:
+        """``(length,)`` rows of a sequence."""
+
+    def frames(self, number: int) -> NDArray[np.int8]:
+        """``(length, H, W)``, mapped from the file."""
+        return np.asarray(self.sequence(number)["frame"])
+
+    def lidar(self, number: int) -> NDArray[np.bool_]:
+        """As :class:`FrameSource`."""
+        return np.array(self.sequence(number)["lidar"])
+
+    def causes(self, number: int) -> NDArray[np.bool_]:
+        """``(length, 3)`` bool, the causes of every slice: speed, distance, new."""
+        rows = self.sequence(number)
+        return np.stack([rows["speed"], rows["distance"], rows["new"]], axis=1)
+
+
+class Slices(CutSet, MappedSlices):
     """The slices that :func:`build_slices` cut: sequences of equal length, read from disk as needed.
 
     A :class:`FrameSource`; ``sequence`` gives ``(length,)`` rows of :func:`slice_dtype`.
@@ -151,6 +173,11 @@ class Slices(CutSet):
         return slice_dtype(self.shape), (self.length,)
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """What slices that are learnt from together have in common: split and generator configuration."""
+        return {"split": self.identity["split"], **self.identity["config"]}
+
+    @property
     def summary(self) -> dict[str, Any]:
         """As :class:`FrameSource`."""
         return {
@@ -161,18 +188,61 @@ class Slices(CutSet):
             "manifest_sha256": self.identity["manifest_sha256"],
         }
 
-    def frames(self, number: int) -> NDArray[np.int8]:
-        """``(length, H, W)``, mapped from the file."""
-        return np.asarray(self.sequence(number)["frame"])
 
-    def lidar(self, number: int) -> NDArray[np.bool_]:
-        """As :class:`FrameSource`."""
-        return np.array(self.sequence(number)["lidar"])
+class JoinedSlices(MappedSlices):
+    """The slices of several folders, one after the other; a :class:`FrameSource`.
 
-    def causes(self, number: int) -> NDArray[np.bool_]:
-        """``(length, 3)`` bool, the causes of every slice: speed, distance, new."""
-        rows = self.sequence(number)
-        return np.stack([rows["speed"], rows["distance"], rows["new"]], axis=1)
+    Args:
+        parts: of one split and one generator configuration, without a sequence in common.
+
+    Raises:
+        ValueError: no parts, or one that does not fit to the first; the message names its folder.
+    """
+
+    def __init__(self, parts: Sequence[Slices]) -> None:
+        if not parts:
+            raise ValueError("slices: found no folder, expected at least one")
+        first, known = parts[0], set[int]()
+        for part in parts:
+            for key, expected in first.settings.items():
+                if (found := part.settings.get(key)) != expected:
+                    raise ValueError(
+                        f"slices: found {key} {found} in {str(part.folder)!r}, "
+                        f"expected {expected} as in {str(first.folder)!r}"
+                    )
+            if again := known.intersection(part.seeds):
+                raise ValueError(
+                    f"slices: found sequence {min(again)} in {str(part.folder)!r}, "
+                    "expected sequences that no other folder holds"
+                )
+            known.update(part.seeds)
+        self.parts = tuple(parts)
+        self.shape = first.shape
+        self.length = first.length
+        self.seeds = [seed for part in parts for seed in part.seeds]
+        self.weathers = [weather for part in parts for weather in part.weathers]
+        self._places = [(part, number) for part in parts for number in range(len(part))]
+
+    def __len__(self) -> int:
+        """Number of sequences."""
+        return len(self._places)
+
+    def sequence(self, number: int) -> NDArray[Any]:
+        """As :class:`MappedSlices`."""
+        part, within = self._places[number]
+        return part.sequence(within)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """That of each part, and how many sequences they are together; of one part, its own."""
+        if len(self.parts) == 1:
+            return self.parts[0].summary
+        return {
+            "split": self.parts[0].settings["split"],
+            "sequences": len(self),
+            "slices": self.length,
+            "folders": [part.summary for part in self.parts],
+        }
 
 
 @dataclass(frozen=True)

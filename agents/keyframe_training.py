@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from agents.keyframe_cnn import KeyframeCNN, average_down, block_length, probability
-from agents.keyframe_data import FrameSource, Slices
+from agents.keyframe_data import FrameSource, MappedSlices
 from agents.keyframe_networks import Detector, TemporalDetector
 from nl_env.classification import (
     Detection,
@@ -140,7 +140,7 @@ class PerceptionTask:
 
     criterion = "loss"
 
-    def __init__(self, training: Slices, validation: Slices, options: SampleOptions) -> None:
+    def __init__(self, training: MappedSlices, validation: MappedSlices, options: SampleOptions) -> None:
         if options.window != 1:
             raise ValueError(f"window: found {options.window}, expected 1: frames are looked at one by one")
         self._windows = KeyframeTask(training, validation, options)

@@ -31,7 +31,7 @@ from tqdm import tqdm
 import nl_env
 from agents.elidar_frames import open_elidar_frames, open_elidar_sequences
 from agents.keyframe_cnn import TEMPORAL_WEIGHTS
-from agents.keyframe_data import FrameSource, Slices, build_slices
+from agents.keyframe_data import FrameSource, JoinedSlices, MappedSlices, build_slices
 from agents.keyframe_networks import ARCHITECTURES, Detector, Perception, Recall, TemporalDetector
 from agents.keyframe_training import (
     KeyframeTask,
@@ -81,9 +81,9 @@ class Options:
     """Which windows of slices its second half learns from."""
     memory_training: TrainingOptions = MEMORY_TRAINING
     """How its second half learns to remember."""
-    data: Path = Path("runs/data/train")
-    """Recordings to learn from, or a folder with ELiDAR's files."""
-    validation: Path = Path("runs/data/val")
+    data: tuple[Path, ...] = (Path("runs/data/train"),)
+    """Recordings to learn from, one folder or several, or a folder with ELiDAR's files."""
+    validation: tuple[Path, ...] = (Path("runs/data/val"),)
     """Recordings that choose the best weights and the thresholds. Of ELiDAR, frames are held out instead."""
     held_out: float = 0.1
     """ELiDAR only: share of the training frames or sequences that is held out."""
@@ -167,21 +167,29 @@ RECIPES: dict[str, tuple[str, Options]] = {
 }
 
 
-def slices_of(recordings: Path, workers: int) -> Slices:
-    """The slices of a folder of recordings, cut into a folder beside it where they are missing."""
-    folder = recordings.with_name(recordings.name + "-slices")
-    with tqdm(desc=f"slices of {recordings.name}", unit="sequence", disable=None) as bar:
-        return build_slices(recordings, folder, workers=workers, progress=bar.update)
+def slices_of(folders: Sequence[Path], workers: int) -> JoinedSlices:
+    """The slices of folders of recordings, each cut into a folder beside it where they are missing."""
+    parts = []
+    for recordings in folders:
+        folder = recordings.with_name(recordings.name + "-slices")
+        with tqdm(desc=f"slices of {recordings.name}", unit="sequence", disable=None) as bar:
+            parts.append(build_slices(recordings, folder, workers=workers, progress=bar.update))
+    return JoinedSlices(parts)
 
 
 def data_of(options: Options) -> tuple[FrameSource, FrameSource]:
     """What is learnt from, and what is judged by."""
-    files = elidar_in(options.data)
-    if files is None:
+    elidar = [files for folder in options.data if (files := elidar_in(folder)) is not None]
+    if not elidar:
         return slices_of(options.data, options.workers), slices_of(options.validation, options.workers)
+    if len(options.data) > 1:
+        folders = ", ".join(map(str, options.data))
+        raise ValueError(
+            f"data: found {folders}, expected one folder with ELiDAR's files, or recordings alone"
+        )
     if options.architecture == TEMPORAL:
-        return open_elidar_sequences(files, options.held_out, options.on_error)
-    return open_elidar_frames(files.require_slicing(), options.held_out)
+        return open_elidar_sequences(elidar[0], options.held_out, options.on_error)
+    return open_elidar_frames(elidar[0].require_slicing(), options.held_out)
 
 
 def run(options: Options, command: str) -> Card:
@@ -213,7 +221,7 @@ def network_of(options: Options, training: FrameSource) -> tuple[nn.Module, dict
 
     Without maps of actors a detector with a memory keeps a first half that was trained before.
     """
-    if options.architecture == TEMPORAL and not isinstance(training, Slices):
+    if options.architecture == TEMPORAL and not isinstance(training, MappedSlices):
         network, card = load_network(options.first_half, ARCHITECTURES)
         if not isinstance(network, TemporalDetector):
             raise ValueError(
@@ -238,7 +246,7 @@ def train_temporal(
     The first needs the maps of actors that recordings have; on other data the second is trained alone.
     """
     halves: list[tuple[str, nn.Module, Callable[[], Task], TrainingOptions]] = []
-    if isinstance(training, Slices) and isinstance(validation, Slices):
+    if isinstance(training, MappedSlices) and isinstance(validation, MappedSlices):
         see = partial(PerceptionTask, training, validation, options.sampling)
         halves.append(("perception", Perception(network), see, options.training))
     remember = partial(RecallTask, network, training, validation, options.memory_sampling)

@@ -243,6 +243,12 @@ def test_detectors_are_trained_by_the_same_command(data, tmp_path, recipe):
     assert card["metrics"]["at_thresholds"]["f1"]["recall_by_cause"] == {}
 
 
+def test_elidar_is_not_learnt_from_together_with_other_folders(data, tmp_path, capsys):
+    assert train_keyframe.main(f"cnn --data {tmp_path} {data} --out {tmp_path}/run".split()) == 2
+    assert "expected one folder with ELiDAR's files" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_whole_sequences_are_followed_in_pieces(data, monkeypatch):
     monkeypatch.setattr(elidar_frames, "PIECE", 20)
     training, validation = open_elidar_sequences(find_files(data), 0.1)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from agents.keyframe_cnn import KeyframeCNN
-from agents.keyframe_data import Slices, build_slices, slice_dtype
+from agents.keyframe_data import JoinedSlices, Slices, build_slices, slice_dtype
 from agents.keyframe_networks import FrameDetector, Perception, Recall, TemporalDetector
 from agents.keyframe_training import (
     KeyframeTask,
@@ -137,6 +137,34 @@ def test_slices_pickle_as_a_path_and_name_damaged_files(tmp_path):
         Slices(data.folder).sequence(0)
     with pytest.raises(FileNotFoundError, match=r"settings\.json"):
         Slices(tmp_path)
+
+
+def test_joined_folders_are_one_source_and_the_card_lists_each(tmp_path):
+    parts = [made_up(tmp_path / "one", sequences=2), made_up(tmp_path / "two", sequences=3, seed=7)]
+    both = JoinedSlices(parts)
+    assert (len(both), both.seeds, len(both.weathers)) == (5, [0, 1, 7, 8, 9], 5)
+    for number, (part, within) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]):
+        np.testing.assert_array_equal(both.sequence(number), parts[part].sequence(within))
+        np.testing.assert_array_equal(both.causes(number), parts[part].causes(within))
+    assert both.summary["sequences"] == 5
+    assert both.summary["folders"] == [part.summary for part in parts]
+    assert JoinedSlices(parts[:1]).summary == parts[0].summary
+    task = PerceptionTask(both, parts[0], PLAIN)
+    assert task.size == 5 * 7  # 20 starts, every third
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(both)).sequence(4), parts[1].sequence(2))
+
+
+def test_folders_that_do_not_fit_together_are_named(tmp_path):
+    first = made_up(tmp_path / "first", sequences=2)
+    with pytest.raises(ValueError, match=r"sequence 1 in .*second-slices"):
+        JoinedSlices([first, made_up(tmp_path / "second", sequences=2, seed=1)])
+    other = made_up(tmp_path / "other", sequences=1, seed=5)
+    marker = other.folder / "settings.json"
+    marker.write_text(marker.read_text().replace('"cutoff_hz": 2000.0', '"cutoff_hz": 30.0'))
+    with pytest.raises(ValueError, match=r"found events .*30\.0.* in .*other-slices.*expected .*2000\.0"):
+        JoinedSlices([first, Slices(other.folder)])
+    with pytest.raises(ValueError, match="found no folder"):
+        JoinedSlices([])
 
 
 def test_windows_cover_the_sequence_and_labels_belong_to_frames(tmp_path):
@@ -313,6 +341,24 @@ def test_the_script_trains_calibrates_and_resumes(tmp_path, recipe, capsys):
     assert "already holds a run" in capsys.readouterr().err
     assert script.main([*arguments, "--resume"]) == 0
     assert weights.read_bytes() == before
+
+
+def test_the_script_takes_several_folders(tmp_path, capsys):
+    for number, name in enumerate(("one", "two", "val")):
+        made_up(tmp_path / name, sequences=2, seed=10 * number)
+    script = training_script()
+    folders = f"--data {tmp_path}/one {tmp_path}/two --validation {tmp_path}/val"
+    options = (
+        "--training.steps 2 --training.batch-size 4 --memory-training.steps 2 --memory-sampling.window 9"
+    )
+    assert script.main(f"temporal {folders} {options} --out {tmp_path}/out".split()) == 0
+    data = read_card(tmp_path / "out" / "best.safetensors").data
+    assert [part["first_seed"] for part in data["training"]["folders"]] == [0, 10]
+    assert data["validation"]["first_seed"] == 20
+    (tmp_path / "two" / "manifest.json").unlink()
+    assert script.main(f"cnn {folders} --out {tmp_path}/cnn".split()) == 2
+    assert str(tmp_path / "two") in capsys.readouterr().err
+    assert not (tmp_path / "cnn").exists()
 
 
 def training_script():
