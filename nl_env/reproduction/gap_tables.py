@@ -105,11 +105,11 @@ def _beside(figures: Figures, networks: Sequence[str]) -> Rows:
 
 
 def _ablation(figures: Figures, names: Mapping[str, str]) -> Rows:
-    """The paper's rows with ours, both on gaps drawn at random."""
+    """The paper's rows with those measured here, both on gaps drawn at random."""
     rows = [["variant", "row", *(metric_label(name) for name in PAPER_METRICS)]]
     for row, key in names.items():
         rows.append([key, "published", *(cell(value, 4) for value in published.ABLATION[key])])
-        rows.append([key, "here", *_plain(figures[row][published.ADAPTIVE])])
+        rows.append([key, row, *_plain(figures[row][published.ADAPTIVE])])
     return rows
 
 
