@@ -20,7 +20,7 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from agents.keyframe_cnn import FRAME_WEIGHTS, TEMPORAL_WEIGHTS, KeyframeCNN
+from agents.keyframe_cnn import FRAME_WEIGHTS, TEMPORAL_WEIGHTS, load_detector
 from agents.oracle import priced_schedule
 from agents.table_policies import FRAME, TEMPORAL, LoadScorers, PlayPolicies
 from nl_env.command_line import command_line, run_command
@@ -144,7 +144,16 @@ class TableKeyframe:
         if not rows:
             raise ValueError("weights: found no detector, expected at least one file")
         paths = tuple(path for _, path in rows)
-        detectors = [DetectorFile(row, KeyframeCNN.load(path).threshold) for row, path in rows]
+        known = [load_detector(path).thresholds for path in paths]
+        detectors = [
+            DetectorFile(row, thresholds.get("default", 0.5), number)
+            for number, ((row, _), thresholds) in enumerate(zip(rows, known, strict=True))
+        ]
+        detectors += [
+            DetectorFile(f"{row}, even", thresholds["even"], number)
+            for number, ((row, _), thresholds) in enumerate(zip(rows, known, strict=True))
+            if "even" in thresholds
+        ]
         job = self.common.job("table-keyframe", data, paths, {})
         files = {seed: file for found in data.values() for seed, file in found.files.items()}
         task = (ScoreTask if release is None else ElidarScoreTask)(files, LoadScorers(paths))
@@ -152,7 +161,10 @@ class TableKeyframe:
         groups = WEATHER_GROUPS if release is None else ELIDAR_WEATHERS
         figures = summarise_keyframes(scored, detectors, self.common.seed, groups)
         thresholds = ", ".join(f"{d.row} {d.threshold:.3f}" for d in detectors)
-        notes = f"All slices count. Thresholds are the weights' own, from validation sequences: {thresholds}."
+        notes = (
+            f"All slices count. Thresholds are the weights' own, from validation sequences: {thresholds}; "
+            "`even` finds as large a share of the keyframes as it leaves alone of the other slices."
+        )
         sections = keyframe_sections(figures)
         if release is None:
             sections += target_section(keyframe_targets(figures, FRAME, TEMPORAL))

@@ -38,15 +38,17 @@ WEATHER_GROUPS = {
 
 @dataclass(frozen=True)
 class DetectorFile:
-    """One trained detector.
+    """One trained detector at one operating point.
 
     Attributes:
         row: row of the table; detectors of one row are training seeds of the same thing.
         threshold: scores above it mean keyframe.
+        scores: which line of a sequence's scores is its own.
     """
 
     row: str
     threshold: float
+    scores: int
 
 
 @dataclass(frozen=True)
@@ -106,8 +108,8 @@ def summarise_keyframes(
     """Figures of every split, and of the weathers and causes of ``"test"``.
 
     Args:
-        splits: sequences with one line of scores per detector.
-        detectors: in that order.
+        splits: sequences with a line of scores for each network.
+        detectors: what is judged.
         seed: draws the bootstrap.
         groups: weathers that are also judged together.
 
@@ -133,8 +135,10 @@ def summarise_keyframes(
 def _group(sequences: Sequence[ScoredSequence], detectors: Sequence[DetectorFile], seed: int) -> Group:
     resamples = resample_sequences(len(sequences), np.random.default_rng(seed))
     summaries = [
-        summarise_detector([sequence.detection(i) for sequence in sequences], detector.threshold, resamples)
-        for i, detector in enumerate(detectors)
+        summarise_detector(
+            [sequence.detection(detector.scores) for sequence in sequences], detector.threshold, resamples
+        )
+        for detector in detectors
     ]
     rows: dict[str, list[dict[str, Estimate]]] = {}
     for detector, summary in zip(detectors, summaries, strict=True):
