@@ -80,6 +80,10 @@ class Options:
     """Training sequences, 10 s each."""
     val_sequences: int = 16
     """Validation sequences, 10 s each."""
+    more_train_sequences: int = 160
+    """Further training sequences, 10 s each, for the detector with a memory."""
+    more_val_sequences: int = 16
+    """Further validation sequences, 10 s each, for the same."""
     test_sequences: int = 48
     """Test sequences, 20 s each."""
     jobs: int = 2
@@ -108,6 +112,7 @@ class Network:
         device_options: how it is told its device.
         table: where it is measured.
         row: its row there.
+        more: it learns from further sequences, too.
     """
 
     name: str
@@ -117,6 +122,7 @@ class Network:
     device_options: tuple[str, ...]
     table: str
     row: str
+    more: bool = False
 
 
 EXTRAPOLATOR, KEYFRAME = "scripts/train_extrapolator.py", "scripts/train_keyframe.py"
@@ -156,6 +162,7 @@ NETWORKS = (
         ("--training.device", "--memory-training.device"),
         "table-keyframe",
         "keyframe-cnn-temporal",
+        more=True,
     ),
 )
 
@@ -166,6 +173,7 @@ class Plan:
     def __init__(self, options: Options) -> None:
         self.options = options
         self.data = {split: options.out / "data" / split for split in ("train", "val", "test")}
+        self.more = {split: options.out / "data" / f"{split}-more" for split in ("train", "val")}
 
     def steps(self, stage: str) -> list[Step]:
         """The commands of one stage, in order."""
@@ -175,6 +183,8 @@ class Plan:
                 self._record("train", options.train_sequences, 10),
                 self._record("val", options.val_sequences, 10),
                 self._record("test", options.test_sequences, 20),
+                self._record_more("train", options.train_sequences, options.more_train_sequences),
+                self._record_more("val", options.val_sequences, options.more_val_sequences),
             ]
         if stage == "pairs":
             # The first detector's training also cuts the slices that all of them learn from.
@@ -213,6 +223,11 @@ class Plan:
         more = ("--depth-period-ms", "10", "--workers", str(self.options.jobs), "--resume")
         return Step(f"record-{split}", (*command.split(), "--out", str(self.data[split]), *more))
 
+    def _record_more(self, split: str, start: int, sequences: int) -> Step:
+        command = f"scripts/record.py --split {split} --start {start} --sequences {sequences} --duration 10"
+        more = ("--workers", str(self.options.jobs), "--resume", "--out", str(self.more[split]))
+        return Step(f"record-{split}-more", (*command.split(), *more))
+
     def _pair_options(self) -> tuple[str, ...]:
         folders = {"data": self.data["train"], "validation": self.data["val"]}
         folders["pairs"] = self.options.out / "pairs"
@@ -222,7 +237,9 @@ class Plan:
     def _train(self, network: Network, seed: int) -> Step:
         data: tuple[str, ...] = self._pair_options()
         if network.train[0] == KEYFRAME:
-            data = ("--data", str(self.data["train"]), "--validation", str(self.data["val"]))
+            parts = (self.data, self.more) if network.more else (self.data,)
+            training, validation = ([str(part[split]) for part in parts] for split in ("train", "val"))
+            data = ("--data", *training, "--validation", *validation)
         device = [part for option in network.device_options for part in (option, self.options.device)]
         out = str(self.trained(network, seed).parent)
         numbered = [part for option in network.seed_options for part in (option, str(seed))]

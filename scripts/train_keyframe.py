@@ -52,14 +52,14 @@ from nl_env.weight_files import Card, load_network, load_strictly, read_tensors,
 TEMPORAL = "keyframe-cnn-temporal"
 MEMORY_SAMPLING = SampleOptions(window=250, stride=25, new_weight=1.0)
 MEMORY_TRAINING = TrainingOptions(
-    steps=300,
+    steps=1200,
     batch_size=16,
     learning_rate=3e-3,
     weight_decay=0.02,
     warmup_steps=20,
     clip_gradient=1.0,
     ema=0.99,
-    evaluate_every=50,
+    evaluate_every=200,
     amp="off",
     threads=1,
 )
@@ -130,14 +130,14 @@ RECIPES: dict[str, tuple[str, Options]] = {
             network={},
             sampling=SampleOptions(),
             training=TrainingOptions(
-                steps=3000,
+                steps=2500,
                 batch_size=64,
                 learning_rate=3e-3,
                 weight_decay=0.02,
                 warmup_steps=100,
                 clip_gradient=1.0,
                 ema=0.995,
-                evaluate_every=300,
+                evaluate_every=500,
                 threads=1,
             ),
             out=Path("runs/keyframe-cnn-temporal"),
