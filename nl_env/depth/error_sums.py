@@ -14,13 +14,16 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from nl_env.depth.lane_sums import add, count, equal, first, magnitude, sound, total, without, zeros
+from nl_env.depth.lane_sums import add, equal, magnitude, sound, total, without, zeros
 from nl_env.lanes import (
     EXACT,
     LANES,
+    first_of,
     from_bits,
     fused,
+    how_many,
     load,
+    load_some,
     row_of,
     shifted_down,
     splat,
@@ -77,8 +80,8 @@ def _add_paper(sums, p_raw, g_raw, max_depth):  # type: ignore[no-untyped-def]
     g = where(use, g_raw, splat(_ONE))
     p = where(use, p_raw, splat(_ONE))
     p = where(p < splat(_FLOOR), splat(_FLOOR), p)
-    used = count(use)
-    if count(equal(p, g)) == LANES:
+    used = how_many(use)
+    if how_many(equal(p, g)) == LANES:
         inside_1, inside_2, inside_3 = inside_1 + used, inside_2 + used, inside_3 + used
     else:
         ratio = p / g
@@ -90,9 +93,9 @@ def _add_paper(sums, p_raw, g_raw, max_depth):  # type: ignore[no-untyped-def]
         squared_log = add(squared_log, log * log)
         relative = add(relative, magnitude(difference) / g)
         squared_relative = add(squared_relative, square / g)
-        inside_1 += count(use & (factor < splat(_DELTA_1)))
-        inside_2 += count(use & (factor < splat(_DELTA_2)))
-        inside_3 += count(use & (factor < splat(_DELTA_3)))
+        inside_1 += how_many(use & (factor < splat(_DELTA_1)))
+        inside_2 += how_many(use & (factor < splat(_DELTA_2)))
+        inside_3 += how_many(use & (factor < splat(_DELTA_3)))
     return valid + used, squared, squared_log, relative, squared_relative, inside_1, inside_2, inside_3
 
 
@@ -100,22 +103,28 @@ def _add_paper(sums, p_raw, g_raw, max_depth):  # type: ignore[no-untyped-def]
 def _add_full(sums, p_raw, g_raw, max_depth, min_depth):  # type: ignore[no-untyped-def]
     """The full-image terms of eight pixels on top of ``sums``."""
     broken, log, inverse, squared_inverse, bad_25, bad_10, false_return, missed_return = sums
-    broken += LANES - count(sound(p_raw) & sound(g_raw))
+    broken += LANES - how_many(sound(p_raw) & sound(g_raw))
     g_return = (g_raw > splat(_ZERO)) & (g_raw < max_depth)
     p_return = (p_raw > splat(_ZERO)) & (p_raw < max_depth)
     g = where(g_return, _larger(g_raw, min_depth), max_depth)
     p = where(p_return, _larger(p_raw, min_depth), max_depth)
-    if count(equal(p, g)) != LANES:
+    if how_many(equal(p, g)) != LANES:
         difference = splat(_ONE) / p - splat(_ONE) / g
         factor = _larger(p, g) / _smaller(p, g)
         log = add(log, _log(factor))
         inverse = add(inverse, magnitude(difference))
         squared_inverse = add(squared_inverse, difference * difference)
-        bad_25 += count(factor > splat(_DELTA_1))
-        bad_10 += count(factor > splat(_TEN_PERCENT))
-        false_return += count(without(p_return, g_return))
-        missed_return += count(without(g_return, p_return))
+        bad_25 += how_many(factor > splat(_DELTA_1))
+        bad_10 += how_many(factor > splat(_TEN_PERCENT))
+        false_return += how_many(without(p_return, g_return))
+        missed_return += how_many(without(g_return, p_return))
     return broken, log, inverse, squared_inverse, bad_25, bad_10, false_return, missed_return
+
+
+@njit(**EXACT)
+def _last(row, column, number):  # type: ignore[no-untyped-def]
+    """The last ``number`` pixels of a row, fewer than eight; 0 in the other lanes."""
+    return load_some(row, column, first_of(number), splat(_ZERO))
 
 
 @njit(**EXACT)
@@ -173,7 +182,7 @@ def paper_sums(pred, truth, max_depth):  # type: ignore[no-untyped-def]
     for i in range(0, whole, LANES):
         sums = _add_paper(sums, load(p, i), load(g, i), limit)
     rest = truth.size - whole
-    last = _add_paper(_no_paper(), first(p, whole, rest), first(g, whole, rest), limit)
+    last = _add_paper(_no_paper(), _last(p, whole, rest), _last(g, whole, rest), limit)
     return _paper_total(sums, last)
 
 
@@ -192,7 +201,7 @@ def full_sums(pred, truth, max_depth, min_depth):  # type: ignore[no-untyped-def
     for i in range(0, whole, LANES):
         sums = _add_full(sums, load(p, i), load(g, i), limit, least)
     rest = truth.size - whole
-    last = _add_full(_no_full(), first(p, whole, rest), first(g, whole, rest), limit, least)
+    last = _add_full(_no_full(), _last(p, whole, rest), _last(g, whole, rest), limit, least)
     return _full_total(sums, last)
 
 
@@ -208,7 +217,7 @@ def both_sums(pred, truth, max_depth, min_depth):  # type: ignore[no-untyped-def
         paper = _add_paper(paper, p_raw, g_raw, limit)
         full = _add_full(full, p_raw, g_raw, limit, least)
     rest = truth.size - whole
-    p_raw, g_raw = first(p, whole, rest), first(g, whole, rest)
+    p_raw, g_raw = _last(p, whole, rest), _last(g, whole, rest)
     last_paper = _add_paper(_no_paper(), p_raw, g_raw, limit)
     last_full = _add_full(_no_full(), p_raw, g_raw, limit, least)
     return _paper_total(paper, last_paper), _full_total(full, last_full)

@@ -18,7 +18,6 @@ from nl_env.lanes import FLOATS, LANES, TRUTHS, Builder, Value, intrinsic
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _DOUBLE, _DOUBLES = ir.DoubleType(), ir.VectorType(ir.DoubleType(), LANES)
-_BYTE = ir.IntType(LANES)
 
 
 class Sums(types.Type):  # type: ignore[misc]
@@ -79,38 +78,6 @@ def total(typingctx, sums, last):  # type: ignore[no-untyped-def]
         return sum_
 
     return types.float64(sums, last), codegen
-
-
-@intrinsic
-def first(typingctx, row, column, number):  # type: ignore[no-untyped-def]
-    """``number`` elements of a row of float32 from ``column`` on, at most eight; 0 in the other lanes."""
-
-    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value, ...]) -> Value:
-        row_, column_, number_ = arguments
-        place = builder.bitcast(builder.gep(row_, [column_]), _FLOATS.as_pointer())
-        # The lowest ``number`` bits: shifted in a wider type, where a shift by eight is defined.
-        wide = ir.IntType(64)
-        ones = builder.sub(builder.shl(wide(1), number_), wide(1))
-        wanted = builder.bitcast(builder.trunc(ones, _BYTE), ir.VectorType(ir.IntType(1), LANES))
-        nothing = ir.Constant(_FLOATS, [0.0] * LANES)
-        how = [place, ir.IntType(32)(4), wanted, nothing]
-        kind = ir.FunctionType(_FLOATS, [argument.type for argument in how])
-        name = f"llvm.masked.load.v{LANES}f32.p0"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), how)
-
-    return FLOATS(row, column, number), codegen
-
-
-@intrinsic
-def count(typingctx, truths):  # type: ignore[no-untyped-def]
-    """In how many of the eight lanes it is true."""
-
-    def codegen(context: Any, builder: Builder, signature: Any, arguments: tuple[Value]) -> Value:
-        kind = ir.FunctionType(_BYTE, [_BYTE])
-        popcount = cgutils.get_or_insert_function(builder.module, kind, f"llvm.ctpop.i{LANES}")
-        return builder.zext(builder.call(popcount, [builder.bitcast(arguments[0], _BYTE)]), ir.IntType(64))
-
-    return types.int64(truths), codegen
 
 
 @intrinsic

@@ -1,7 +1,7 @@
 """What surrounds the refinement network's convolutions, in compiled loops, for runtimes that are slow at it.
 
-OpenVINO and ONNX Runtime take as long for the network's folding, slicing and averaging as for a third of its
-convolutions (in bfloat16 longer than for all of them). So they are given the convolutions alone, with the
+OpenVINO and ONNX Runtime spend much of the network's time on its folding, slicing and averaging, in bfloat16
+the larger part. So they are given the convolutions alone, with the
 channels of a place side by side at both ends; what comes before and after happens here, in one pass each.
 Answers are those of :class:`nl_env.depth.refine.RefineNetwork` but for rounding.
 """

@@ -74,8 +74,7 @@ def _keep_precise(core: openvino.Core, model: openvino.Model) -> openvino.Model:
     """``model`` with the mark "precise" on what stays in float32.
 
     That is everything but costly convolutions on images smaller than the largest that is convolved, and
-    everything before the first costly convolution: the error in metres falls by a third, and nine tenths of
-    the multiplications are still in bfloat16.
+    everything before the first costly convolution: little of the work, and much of the error in metres.
     Only files can hold such marks; Python has no other way to set them.
     """
     import openvino
