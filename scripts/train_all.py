@@ -259,13 +259,18 @@ class Plan:
         ours, paper, frames, temporal = (
             [str(self.trained(network, seed)) for seed in seeds] for network in NETWORKS
         )
+        test = ["--data", str(self.data["test"])]
+        detectors = ["--weights", *frames, "--temporal-weights", *temporal]
         tables = {
             "table-keyframe": [
+                *test,
                 *("--train", str(self.data["train"]), "--train-sequences", str(shown)),
-                *("--weights", *frames, "--temporal-weights", *temporal),
+                *detectors,
             ],
-            "table-rates": ["--weights", *ours, "--paper-weights", *paper],
+            "table-weather": ["--worlds", str(min(self.options.test_sequences, 24)), *detectors],
+            "table-rates": [*test, "--weights", *ours, "--paper-weights", *paper],
             "table-end-to-end": [
+                *test,
                 *("--weights", ours[0], "--paper-weights", paper[0]),
                 *("--keyframe-weights", frames[0], "--temporal-weights", temporal[0]),
             ],
@@ -273,8 +278,8 @@ class Plan:
         if "ablations" in self.options.stages:
             trained = [str(self.options.out / name / NETWORKS[0].file) for name in ABLATIONS]
             variants = [*paper, *ours, *trained]
-            tables["table-ablation"] = ["--variants", *variants, "--weights", *ours]
-        common = ["--data", str(self.data["test"]), "--workers", str(self.options.jobs), "--resume"]
+            tables["table-ablation"] = [*test, "--variants", *variants, "--weights", *ours]
+        common = ["--workers", str(self.options.jobs), "--resume"]
         return [
             Step(name, ("scripts/reproduce.py", name, *given, *common, "--out", str(self.options.out / name)))
             for name, given in tables.items()

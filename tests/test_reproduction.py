@@ -420,7 +420,7 @@ def test_json_has_no_nan():
 
 def test_every_table_has_its_marks_in_the_document():
     text = (reproduce.ROOT / "docs" / "results.md").read_text()
-    for table in ("table-keyframe", "table-rates", "table-ablation", "table-end-to-end"):
+    for table in ("table-keyframe", "table-weather", "table-rates", "table-ablation", "table-end-to-end"):
         begin, end = document.marks(table)
         assert text.count(begin) == text.count(end) == 1
 

@@ -55,7 +55,8 @@ def test_every_seed_of_every_network_is_trained_into_the_folder_that_the_tables_
     read = {part for step in plan.steps("tables") for part in step.command if part.endswith(".safetensors")}
     assert read == {str(plan.trained(n, seed)) for n in NETWORKS for seed in (0, 1)}
     assert {step.name for step in plan.steps("tables")} == {network.table for network in NETWORKS} | {
-        "table-end-to-end"
+        "table-weather",
+        "table-end-to-end",
     }
 
 
@@ -112,7 +113,7 @@ def test_every_planned_command_is_understood_by_its_script(tmp_path, monkeypatch
         monkeypatch.setattr(module, "run", work)
     for command in ("PairsCommand", "Ours", "Paper"):
         monkeypatch.setattr(getattr(train_extrapolator, command), "run", work)
-    for table in ("TableKeyframe", "TableRates", "TableAblation", "TableEndToEnd"):
+    for table in ("TableKeyframe", "TableWeather", "TableRates", "TableAblation", "TableEndToEnd"):
         monkeypatch.setattr(getattr(reproduce, table), "run", work)
     scripts = {
         f"scripts/{module.__name__.split('.')[-1]}.py": module

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nl_env.config import DrivingConfig, to_dict
 from nl_env.recording.manifest import read_manifest
 
 
@@ -29,6 +30,39 @@ class Sequences:
     digest: str
     settings: Mapping[str, Any]
     left_out: tuple[str, ...] = ()
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Of the sequences."""
+        return tuple(self.files)
+
+
+@dataclass(frozen=True)
+class SimulatedWorlds:
+    """Sequences that are simulated while they are measured.
+
+    Attributes:
+        split: train, val or test.
+        seeds: of the sequences.
+        config: what is simulated.
+        left_out: none.
+    """
+
+    split: str
+    seeds: tuple[int, ...]
+    config: DrivingConfig
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the seeds and the configuration."""
+        content = {"seeds": self.seeds, "config": to_dict(self.config)}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """What readers of a table are told."""
+        return {"resolution": self.config.resolution, "duration": self.config.scene.duration_s}
 
 
 def find_sequences(folder: Path, most: int | None = None) -> Sequences:

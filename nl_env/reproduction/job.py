@@ -14,7 +14,7 @@ from typing import Any
 import nl_env
 from nl_env.config import choice
 from nl_env.elidar.metadata import ON_ERROR
-from nl_env.reproduction.data import Sequences
+from nl_env.reproduction.data import Sequences, SimulatedWorlds
 from nl_env.reproduction.document import (
     Section,
     check_document,
@@ -59,7 +59,7 @@ class Job:
     Args:
         table: its name, as on the command line.
         output: where to.
-        data: the recordings, by what they are for.
+        data: the recordings or simulated worlds, by what they are for.
         weights: every file of weights that is used.
         settings: what else determines the results, JSON-ready.
 
@@ -72,7 +72,7 @@ class Job:
         self,
         table: str,
         output: Output,
-        data: Mapping[str, Sequences],
+        data: Mapping[str, Sequences | SimulatedWorlds],
         weights: Iterable[Path],
         settings: Mapping[str, Any],
     ) -> None:
@@ -98,7 +98,7 @@ class Job:
     @property
     def seeds(self) -> list[int]:
         """Every sequence that is measured."""
-        return [seed for found in self.data.values() for seed in found.files]
+        return [seed for found in self.data.values() for seed in found.seeds]
 
     def measure(
         self,
@@ -125,12 +125,12 @@ class Job:
         )
         by_seed = {result.seed: result for result in results}
         parts = {
-            name: [by_seed[seed] for seed in found.files if seed in by_seed]
+            name: [by_seed[seed] for seed in found.seeds if seed in by_seed]
             for name, found in self.data.items()
         }
         for name, part in parts.items():
             if not part:
-                reasons = "; ".join(self.left_out[seed] for seed in self.data[name].files)
+                reasons = "; ".join(self.left_out[seed] for seed in self.data[name].seeds)
                 raise ValueError(f"{name}: found no sequence that can be read ({reasons})")
         return parts
 
@@ -141,7 +141,7 @@ class Job:
     def publish(self, sections: Sequence[Section], figures: Any, command: str, notes: str) -> str:
         """Write ``results.json`` and ``table.md``, update the document; the text of the tables."""
         parts = "; ".join(
-            f"{len(found.files.keys() - self.left_out.keys())} {found.split} sequences ("
+            f"{len(set(found.seeds) - self.left_out.keys())} {found.split} sequences ("
             + ", ".join(f"{name} {value}" for name, value in found.settings.items())
             + ")"
             for found in self.data.values()
