@@ -52,9 +52,7 @@ class ScoredWorld:
 
     def save(self, path: Path) -> None:
         """Write everything to one ``.npz`` file (no pickle)."""
-        np.savez_compressed(
-            path, seed=self.seed, causes=self.causes, lidar=self.lidar, scores=self.scores, allow_pickle=False
-        )
+        np.savez_compressed(path, seed=self.seed, causes=self.causes, lidar=self.lidar, scores=self.scores)
 
     @classmethod
     def load(cls, path: Path) -> ScoredWorld:
