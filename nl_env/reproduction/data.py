@@ -45,13 +45,16 @@ class SimulatedWorlds:
         split: train, val or test.
         seeds: of the sequences.
         config: what is simulated.
-        left_out: none.
     """
 
     split: str
     seeds: tuple[int, ...]
     config: DrivingConfig
-    left_out: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """None: a simulation cannot be damaged."""
+        return ()
 
     @property
     def digest(self) -> str:
